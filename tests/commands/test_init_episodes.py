@@ -64,14 +64,6 @@ def test_what_fills_up_stacked_episodes_is_cut_off(tmp_path: Path) -> None:
     assert_recorded(logs_of(tmp_path / "x.npz"), LENGTHS)
 
 
-def test_episodes_that_end_at_rest_are_not_cut(tmp_path: Path) -> None:
-    """Encoders repeat themselves to the last bit where joints stand; torques do not."""
-    q, dq = Q.copy(), DQ.copy()
-    q[:, 400:], dq[:, 400:] = q[:, 400:401], 0.0
-    np.savez(tmp_path / "x.npz", q=q, qd=dq, tau=TAU, t=TIME)
-    assert [len(log) for log in logs_of(tmp_path / "x.npz")] == [SAMPLES] * EPISODES
-
-
 def test_a_group_with_another_number_of_joints_is_named(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         for number in range(EPISODES):

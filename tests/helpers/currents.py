@@ -16,7 +16,7 @@ from synthetic import Oracle, load, make_log
 from true_robots import true_parameters
 
 from torchid.logs import write_log
-from torchid.logs.column_map import fits
+from torchid.logs.columns import fits
 from torchid.robot import Payload
 
 FEET = [f"{end}_{side}_foot" for end in ("front", "rear") for side in ("left", "right")]

@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from torchid.logs import Columns, Log
-from torchid.logs.column_map import check_columns
+from torchid.logs.columns import check_columns
 
 Array = NDArray[Any]
 LEGS = ("front_right", "front_left", "rear_right", "rear_left")

@@ -161,60 +161,24 @@ class Evil:
 _DEEP = "(" * 10_000 + ")" * 10_000
 _ENTRIES: dict[str, bytes] = {
     "a pickled object": _npy(np.array([Evil()], dtype=object), True),
-    "a bare pickle": b"\x80\x04\x95" + bytes(40),
     "10^15 numbers declared": header("(1000000000000000,)") + bytes(64),
-    "10^9 numbers declared": header("(1000000000,)") + bytes(64),
-    "2^63 numbers declared": header("(9223372036854775807,)"),
-    "more than 64 bits declared": header("(99999999999999999999999999,)"),
     "a negative size": header("(-1,)") + bytes(64),
     "sizes that overflow": header("(4294967296, 4294967296, 4294967296)"),
-    "sizes with a zero": header("(0, 9223372036854775807)"),
-    "a size that is true": header("(True,)") + bytes(8),
-    "a size that is a float": header("(2.0,)") + bytes(16),
-    "a size that is text": header("'2'") + bytes(16),
-    "sizes in a list": header("[2]") + bytes(16),
-    "100 axes": header("(" + "1, " * 100 + ")") + bytes(8),
-    "Fortran order": header("(2,)", order="True") + bytes(16),
-    "order by a number": header("(2,)", order="7") + bytes(16),
     "an object type": header("(1,)", "'|O'") + bytes(8),
-    "a void type": header("(2,)", "'|V8'") + bytes(16),
-    "a void of no size": header("(1000000000000,)", "'|V0'"),
-    "text of no size": header("(1000000000000,)", "'<U0'"),
     "text of 2^31 characters": header("(1,)", "'<U2147483647'"),
-    "a time type": header("(2,)", "'<M8[ns]'") + bytes(16),
     "a structured type": header("(2,)", "[('a', '<f8'), ('b', '|S3')]") + bytes(22),
-    "a nested type": header("(2,)", "[('a', [('b', '<f8', (1000000, 1000000))])]") + bytes(16),
-    "a type with titles": header("(2,)", "[(('t', 'a'), '<f8')]") + bytes(16),
     "a type that is code": header("(2,)", "__import__('os').system('touch pwned')") + bytes(16),
-    "a type that nothing knows": header("(2,)", "'<q9'") + bytes(16),
-    "a type of 10^6 fields": header("(1,)", repr([(f"f{i}", "<f8") for i in range(50_000)]), version=2),
     "a header of brackets": header(_DEEP, version=2) + bytes(16),
-    "a header without end": b"\x93NUMPY\x01\x00\xff\xff{'descr'",
     "a header of 4 GiB": b"\x93NUMPY\x02\x00\xff\xff\xff\xff{'descr'",
-    "a header that is no mapping": b"\x93NUMPY\x01\x00\x02\x00[]",
-    "a version that does not exist": b"\x93NUMPY\x09\x00\x02\x00{}",
-    "a header with NUL": header("(2,)\0") + bytes(16),
-    "a header that is not UTF-8": header("(2,)").replace(b"descr", b"d\xff\xfer"),
     "nothing": b"",
-    "an archive in the archive": b"PK\x03\x04" + bytes(100),
     "data missing": header("(40,)") + bytes(100),
     "data left over": header("(40,)") + bytes(320) + bytes(10**6),
 }
 _ENTRY_NAMES = {
     "an absolute entry": "/etc/time.npy",
     "an entry that climbs": "../../time.npy",
-    "an entry in a folder": "a/time.npy",
-    "an entry with a backslash": "..\\time.npy",
-    "an entry with a drive": "C:time.npy",
-    "an entry without a suffix": "time",
-    "an entry of another suffix": "joint_torque.pkl",
-    "an entry with NUL": "ti\0me.npy",
-    "an entry with a line break": "time\nroot.npy",
     "an entry with an escape": "\x1b[2Jtime.npy",
     "an entry of 60000 letters": "t" * 60_000 + ".npy",
-    "an entry without a name": ".npy",
-    "an entry of another script": "tïme☃.npy",
-    "a folder": "time/",
 }
 
 
@@ -222,12 +186,6 @@ def _twice(path: Path) -> None:
     write_arrays(path, fields())
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("time.npy", archive.read("time.npy"))
-
-
-def _also_without_suffix(path: Path) -> None:
-    write_arrays(path, fields())
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr("time", archive.read("time.npy"))
 
 
 def _bomb(mebibytes: int, declared: int | None = None) -> Callable[[Path], None]:
@@ -288,32 +246,14 @@ def _overlapping(path: Path) -> None:
     path.write_bytes(data)
 
 
-def _comment(path: Path) -> None:
-    write_arrays(path, fields())
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.comment = b"PK\x05\x06" * 10_000
-
-
 _ARCHIVES: dict[str, Callable[[Path], None]] = {
     "a name twice": _twice,
-    "a name with and without suffix": _also_without_suffix,
-    "a bomb of 60 MiB": _bomb(60),
     "a bomb of 2 GiB": _bomb(2048),
     "a bomb that declares 1 byte": _bomb(1024, 1),
-    "a bomb that declares what fits": _bomb(1024, 640 + 128),
-    "a bomb that declares 2^62": _bomb(1, 2**62),
-    "201 entries": _many(201),
     "20000 entries": _many(20_000),
     "LZMA": _method(zipfile.ZIP_LZMA),
-    "bzip2": _method(zipfile.ZIP_BZIP2),
-    "an unknown method": _flagged(10, 97),
     "encrypted entries": _flagged(8, 1),
-    "a version from the future": _flagged(6, 99),
     "overlapping entries": _overlapping,
-    "a comment of end marks": _comment,
-    "an empty archive": lambda path: zipfile.ZipFile(path, "w").close(),
     "an empty file": lambda path: void(path.write_bytes(b"")),
-    "a text": lambda path: void(path.write_text("time\n0\n")),
     "zeros": lambda path: void(path.write_bytes(bytes(10**6))),
-    "end marks": lambda path: void(path.write_bytes(b"PK\x05\x06" * 10**5)),
 }

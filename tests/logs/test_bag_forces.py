@@ -31,7 +31,7 @@ from synthetic import Array
 
 from torchid.cli import main
 from torchid.config.log_reading import load_topics
-from torchid.errors import ConfigError, LogError, TorchidWarning
+from torchid.errors import ConfigError, LogError
 from torchid.logs import Log, read_log
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*no stamps:torchid.errors.TorchidWarning")  # std_msgs have none
@@ -86,13 +86,6 @@ def test_each_contact_is_a_place_in_an_array(tmp_path: Path, kind: str) -> None:
     assert log.contact_wrench is None
 
 
-@pytest.mark.parametrize("kind", ["Float32", "Float64"])
-def test_a_number_alone_needs_no_place(tmp_path: Path, kind: str) -> None:
-    entries = numbers(kind, FORCES[:, 1])
-    np.testing.assert_array_equal(force_of(tmp_path / "x.bag", entries, topic="/foot_forces"), FORCES[:, 1])
-    np.testing.assert_array_equal(force_of(tmp_path / "x.bag", entries, topic="/foot_forces", sign=-1), -FORCES[:, 1])
-
-
 def test_a_wrench_of_which_one_component_is_read_is_such_a_force(tmp_path: Path) -> None:
     values = np.arange(1.0, 7.0)
     stamped = [("/w", s, WRENCH, wrench(s, values, "pad")) for s in map(int, STAMPS)]
@@ -123,11 +116,6 @@ def test_contacts_of_every_kind_stand_beside_each_other(tmp_path: Path) -> None:
     np.testing.assert_array_equal(value(log.contact_force_normal).T, [nan, up, -up, up, nan])
     assert np.isfinite(value(log.contact_wrench_local)).all(axis=(0, 2)).tolist() == [True, True, False, False, False]
     assert value(log.contact_active).astype(int).T.tolist() == [[1] * 4, [1] * 4, [0] * 4, [0, 1, 1, 1], [1] * 4]
-
-
-def test_numbers_without_stamps_come_when_they_are_received(tmp_path: Path) -> None:
-    with pytest.warns(TorchidWarning, match="/foot_forces: no stamps"):
-        force_of(tmp_path / "x.mcap", numbers("Float32", FORCES[:, 0]), topic="/foot_forces")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from bags import (
     JOINT_STATE,
     ROS1,
@@ -29,7 +28,6 @@ from bags import (
     write_folder,
 )
 
-from torchid.config import dump_config, load_config
 from torchid.errors import ConfigError, LogError, TorchidWarning, UnknownNameError
 from torchid.logs import read_log
 
@@ -128,7 +126,7 @@ def test_every_package_that_is_missing_is_named(
     for name in [*sys.modules, *absent]:
         if name.partition(".")[0] in absent:
             monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.delitem(sys.modules, "torchid.logs.ros_files", raising=False)
+    monkeypatch.delitem(sys.modules, "torchid.logs.bags", raising=False)
     with pytest.raises(LogError, match=f"a bag, but {found}; accepted: "):
         read_log(path, parsed({"joint_states": "/joint_states"}))
 
@@ -187,25 +185,3 @@ def test_mcap_files_of_any_compression_read_alike_with_and_without_an_index(
     path.write_bytes(mcap_bytes(entries, "json"))
     with pytest.raises(LogError, match="/joint_states: messages serialized as 'json'; accepted: cdr"):
         read_log(path, parsed({"joint_states": "/joint_states"}))
-
-
-def test_a_pattern_also_stands_for_folders_that_hold_a_bag(tmp_path: Path) -> None:
-    for name in ("walk_2", "walk_1"):
-        write_folder(tmp_path / name, ".mcap", joints_at(STAMPS))
-    (tmp_path / "walk_notes").mkdir()
-    settings = {
-        "robot": {"urdf": "a.urdf"},
-        "logs": {"train": ["walk_*"], "topics": {"joint_states": "/joint_states", "imu": {"topic": "/imu"}}},
-        "sensors": "full",
-        "output": "run",
-    }
-    (tmp_path / "a.yaml").write_text(yaml.safe_dump(settings))
-    config = load_config(tmp_path / "a.yaml", ["logs.topics.imu.frame=chest"])
-    assert config.logs.train == [tmp_path / "walk_1", tmp_path / "walk_2"]
-    (tmp_path / "b.yaml").write_text(dump_config(config))
-    assert load_config(tmp_path / "b.yaml").logs == config.logs
-    assert config.logs.topics is not None
-    assert config.logs.topics.imu is not None
-    assert (config.logs.topics.imu.topic, config.logs.topics.imu.frame) == ("/imu", "chest")
-    with pytest.raises(UnknownNameError, match=r"logs.topics.rate_topic: unknown name 'odom'"):
-        load_config(tmp_path / "a.yaml", ["logs.topics.rate_topic=odom"])

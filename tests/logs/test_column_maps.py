@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from torchid.errors import ConfigError, LogError
 from torchid.logs import Columns, Log, read_log
 from torchid.logs.blocks import open_log_blocks
-from torchid.logs.column_map import check_columns
+from torchid.logs.columns import check_columns
 from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS
 from torchid.logs.units import UNITS, quantities_of, unit_factor
 

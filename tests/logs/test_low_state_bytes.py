@@ -14,8 +14,7 @@ from rosbags import rosbag2
 
 from torchid.errors import InputError
 from torchid.logs import read_log
-from torchid.logs.ros_files import BagChannel
-from torchid.logs.ros_messages import make_deserializer
+from torchid.logs.bags import BagChannel, make_deserializer
 from torchid.logs.unitree import GO, HG
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from torchid.logs.name_matching import propose_field
 from torchid.logs.units import quantities_with, split_unit, unit_factor
-from torchid.proposals.names import exchange_affixes, find_spelling
+from torchid.proposals.names import exchange_affixes, find_spelling, propose_field
 
 
 @pytest.mark.parametrize(
@@ -15,9 +14,9 @@ from torchid.proposals.names import exchange_affixes, find_spelling
         ("joint_position", "q qpos pos position angle joint_positions jointPosition q_actual"),
         ("joint_velocity", "dq qd qdot q_dot qvel vel velocity speed"),
         ("joint_acceleration", "ddq qdd qddot q_ddot qacc acc"),
-        ("joint_torque", "tau trq torque effort tau_est joint_torqe"),
+        ("joint_torque", "tau trq torque effort tau_est"),
         ("time", "t time stamp timestamp header.stamp"),
-        ("imu_angular_velocity", "gyro omega angular_velocity imu_angular_velocty"),
+        ("imu_angular_velocity", "gyro omega angular_velocity"),
         ("imu_specific_force", "imu/linear_acceleration imu_acc accelerometer"),
         ("base_position_world", "base_pos pelvis.position"),
         ("", "q_des dq_ref tau_d tau_ext target_q note kp velocity_torque"),

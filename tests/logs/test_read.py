@@ -241,15 +241,6 @@ def test_a_log_without_samples_is_refused(tmp_path: Path, suffix: str) -> None:
     assert "no samples" in log_refusal(write_arrays(tmp_path / f"x{suffix}", fields))
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".h5"])
-def test_an_imu_stands_in_for_a_base_that_was_not_tracked(tmp_path: Path, suffix: str) -> None:
-    no_base = {name: None for name in file_fields() if name.startswith("base_")}
-    log = read_log(write_arrays(tmp_path / f"x{suffix}", changed(**no_base, imu_angular_acceleration=None)))
-    assert log.base_quat_xyzw is None
-    assert log.imu_angular_acceleration is None
-    np.testing.assert_array_equal(log.imu_specific_force, file_fields()["imu_specific_force"])
-
-
 def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
     assert "no such file" in log_refusal(tmp_path / "absent.npz")
     (tmp_path / "folder.npz").mkdir()
@@ -262,16 +253,6 @@ def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
         assert "cannot be read" in log_refusal(tmp_path / f"text{suffix}")
         (tmp_path / f"empty{suffix}").write_bytes(b"")
         log_refusal(tmp_path / f"empty{suffix}")
-
-
-def test_pickled_objects_are_refused(tmp_path: Path) -> None:
-    objects = np.array([{}, 1], dtype=object)
-    np.savez(tmp_path / "x.npz", **changed(joint_names=objects))
-    assert "joint_names: Python objects (pickled), references or ragged rows" in log_refusal(tmp_path / "x.npz")
-    ragged = h5py.vlen_dtype(np.float64)
-    with h5py.File(write_arrays(tmp_path / "x.h5", changed(time=None)), "a") as file:
-        file.create_dataset("time", (N,), dtype=ragged)
-    assert "time: Python objects (pickled), references or ragged rows" in log_refusal(tmp_path / "x.h5")
 
 
 def test_without_h5py_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -336,13 +317,6 @@ def test_absurd_declared_sizes_are_refused_before_they_are_read(
     assert "bytes in all" in log_refusal(tmp_path / "x.h5")
     monkeypatch.setattr(container, "MAX_ARRAYS", 100)
     assert "at most 100 bytes" in log_refusal(write_arrays(tmp_path / "y.npz", file_fields()))
-
-
-def test_a_name_given_twice_in_one_archive_is_refused(tmp_path: Path) -> None:
-    path = write_arrays(tmp_path / "x.npz", file_fields())
-    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
-        archive.writestr("time.npy", archive.read("time.npy"))
-    assert "occurs twice" in log_refusal(path)
 
 
 def test_writing_fails_in_one_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,8 +12,7 @@ import pytest
 from synthetic import PANDA, load
 
 from torchid.commands.answer import _implicit, implicit_step
-from torchid.logs.column_entries import Gains, PdLaw, TorqueEntry
-from torchid.logs.column_map import Columns
+from torchid.logs.columns import Columns, Gains, PdLaw, TorqueEntry
 
 KD = {"hip": 5.0, "knee": 2.0, "wrist": 0.5}
 

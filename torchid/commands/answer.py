@@ -17,7 +17,7 @@ from torchid.fitting.noise import AT_THE_FLOOR, unexplained_joints
 from torchid.fitting.posterior import FittedPosterior
 from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.contacts import MAX_MASS_ERROR
-from torchid.logs.column_map import values_by_name
+from torchid.logs.columns import values_by_name
 from torchid.logs.time_range import log_title
 from torchid.parameters import COULOMB, PER_BODY
 from torchid.problem import Metrics

@@ -42,18 +42,21 @@ from torchid.errors import (
 )
 from torchid.fitting.experiment import is_along_base, resolve_contacts, set_up
 from torchid.logs import Columns, Log, Topics
-from torchid.logs.column_map import FILL_IN
+from torchid.logs.columns import FILL_IN
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.log import VARIANTS
 from torchid.logs.read import read_recordings
-from torchid.logs.table_files import is_text_table
-from torchid.logs.table_headers import read_header
-from torchid.logs.tables import sample_row_names
 from torchid.logs.time_range import split_range
 from torchid.parameters import GRAVITY
 from torchid.proposals.columns import MapProposal, joined, propose_map
 from torchid.proposals.names import RobotNames
-from torchid.proposals.samples import find_episodes, read_bag_sample, read_sample, stated_names, with_samples_first
+from torchid.proposals.samples import (
+    find_episodes,
+    read_bag_sample,
+    read_sample,
+    stated_names,
+    with_samples_first,
+)
 from torchid.proposals.topics import USED_TYPES, frame_of, propose_topics
 from torchid.reading.log_reader import memory_needed
 from torchid.robot import Robot, load_robot
@@ -175,7 +178,7 @@ _HELD = (
 
 def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContact], set[str], MapProposal]:
     """Contacts, fields and a map of a table or arrays, or of several that are one log."""
-    samples, in_degrees, size, rows = [], set[str](), 0.0, None
+    samples, size = [], 0.0
     is_table = existing_log_kind(files[0]) is LogKind.TABLE
     for file in files:
         size = memory_needed(file, PreprocessingConfig().memory_gb, size)
@@ -183,29 +186,19 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
             accepted = "a log of a part of the recording, whose map holds for all of it"
             raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
         with about_file(file):
-            is_one_table = existing_log_kind(file) is LogKind.TABLE
-            if is_one_table and (rows := sample_row_names(file)) is not None and len(files) > 1:
-                accepted = "one table, joined by stamp and joint; or a column for each joint"
-                found = "a row for each joint, in one of several files"
-                raise LogError(file, f"column '{rows.column}'", found, accepted)
-            samples.append(read_sample(file, rows))
-            if is_one_table and is_text_table(file) and read_header(file).in_degrees:
-                in_degrees |= set(samples[-1])
+            samples.append(read_sample(file))
     episodes = find_episodes(samples[0]) if len(files) == 1 and not is_table else None
     samples = [episodes.sample] if episodes else named_apart(samples, [file.name for file in files])
     sample, turned = with_samples_first(joined(samples)) if not is_table else (joined(samples), "")
     lists = [name for name, x in sample.items() if x is not None and x.dtype.kind not in "fiub"]
     texts = [*sample, *(text for name in lists for text in stated_names(sample, name))]
     contacts = guess_contacts(robot, stated_contacts(sample, robot), texts)
-    proposal = propose_map(sample, _names_of(robot, contacts), samples if len(files) > 1 else (), in_degrees)
+    proposal = propose_map(sample, _names_of(robot, contacts), samples if len(files) > 1 else ())
     if turned:
         proposal.assumed["columns"] = turned
     if episodes is not None:
         proposal.columns = {"episodes": episodes.entry, **proposal.columns}
         proposal.assumed["episodes"] = episodes.note
-    if rows is not None:
-        proposal.columns = {"rows_of": rows.column, **proposal.columns}
-        proposal.assumed["rows_of"] = "the column that names the joint of each row, as rows share stamps"
     return contacts, proposal.fields, proposal
 
 
@@ -304,7 +297,7 @@ def _describe_map(
     """The robot, and what of a map there is."""
     frames = join_names([contact.frame for contact in contacts])
     out.found.append(f"{len(robot.joint_names)} joints" + f", contacts {frames}" * bool(contacts))
-    no_fields = ("_order", "_name", "ignore", "episodes", "rows_of")
+    no_fields = ("_order", "_name", "ignore", "episodes")
     if known := [x for x, entry in proposal.columns.items() if not x.endswith(no_fields) and FILL_IN not in str(entry)]:
         out.found.append(f"{proposal.key} of {', '.join(known)}")
     open_keys = [key for key, entry in proposal.columns.items() if FILL_IN in str(entry)]

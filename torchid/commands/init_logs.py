@@ -11,13 +11,13 @@ import numpy as np
 
 from torchid.errors import InputError, LogError, format_count, join_names
 from torchid.logs import Log
-from torchid.logs.column_entries import OF_FILE
-from torchid.logs.columns import is_column
+from torchid.logs.columns import OF_FILE
 from torchid.logs.containers import ARRAYS, TABLES, list_bag_files
 from torchid.logs.cutoff import choose_cutoff
 from torchid.logs.low_pass import DROPPED_PERIODS
-from torchid.logs.name_matching import propose_field
+from torchid.logs.schema import native_field
 from torchid.logs.time_range import JOINED
+from torchid.proposals.names import propose_field
 from torchid.proposals.samples import FileSample, increases, numbers_of, read_sample
 
 _MOTION = ("joint_position", "base_quat_xyzw", "base_position_world", *("imu_specific_force", "imu_angular_velocity"))
@@ -74,7 +74,7 @@ def _step_of(file: Path) -> float | None:
 def named_apart(samples: Sequence[FileSample], files: Sequence[str]) -> list[FileSample]:
     """Columns of several files, those that others have too with the name of the file before them, but for stamps."""
     often = Counter(name for sample in samples for name in sample)
-    again = {name for name, n in often.items() if n > 1 and not is_column(name) and propose_field(name) != "time"}
+    again = {name for name, n in often.items() if n > 1 and not native_field(name) and propose_field(name) != "time"}
     if len(set(files)) < len(files):
         return list(samples)
     return [

@@ -34,7 +34,7 @@ from torchid.config.robot import (
 )
 from torchid.config.settings_files import FileKind, Settings, load, plain_sections
 from torchid.errors import ConfigError, about_file
-from torchid.logs.column_map import check_columns
+from torchid.logs.columns import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
 from torchid.settings import (

@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from torchid.config.settings_files import FileKind, Settings, load
 from torchid.errors import about_file
 from torchid.logs import Columns, Topics
-from torchid.logs.column_map import check_columns
+from torchid.logs.columns import check_columns
 from torchid.logs.flags import ContactThreshold
 from torchid.logs.ros_topics import check_topics
 from torchid.logs.unitree import JOINT_ORDERS

@@ -34,8 +34,7 @@ from torchid.fitting.noise import NoiseSummary, estimate_noise, mean_noise_squar
 from torchid.fitting.prior_knowledge import conditions_from, known_masses
 from torchid.fitting.robust import RobustLoss
 from torchid.log_checks.model import Declared
-from torchid.logs.column_entries import for_all
-from torchid.logs.column_map import fits, require_names, values_of_all
+from torchid.logs.columns import fits, for_all, require_names, values_of_all
 from torchid.logs.ros_topics import Topics, require_joints
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples

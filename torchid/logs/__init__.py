@@ -1,10 +1,9 @@
 """Logs: read and write the file format, filter, differentiate and resample.
 
 - the format: `log` (fields, shapes), `read`, `containers`, `arrays`, `lazy_arrays`, `time_range`, `episodes`
-- files of arrays: `hdf5`, `matlab`, `json_files`; of tables: `tables`, `table_files`, `table_headers`, `columns`
-- bags: `ros_read`, `ros_topics`, `ros_files`, `ros_messages`, `unitree`, `alignment`
-- maps of foreign columns: `column_map`, `column_entries`, `column_matching`, `entry_values`, `mapped_fields`, `units`,
-  `name_matching`, `force_plates`
+- files of arrays: `hdf5`, `matlab`, `json_files`; of tables: `tables`, `table_files`
+- bags: `bags`, `bag_files`, `ros_topics`, `unitree`; series with stamps of their own: `alignment`
+- maps of columns and arrays to fields: `columns`, `schema`, `units`, `force_plates`
 - preprocessing: `preprocess`, `timeline`, `low_pass`, `cutoff`, `segments`, `gaps`, `quaternion`, `flags`,
   `dry_friction`, `signal_noise`; of large logs `blocks`
 """
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING
 import lazy_loader  # type: ignore[import-untyped]
 
 if TYPE_CHECKING:
-    from torchid.logs.column_map import Columns
+    from torchid.logs.columns import Columns
     from torchid.logs.log import Log
     from torchid.logs.read import read_log, write_log
     from torchid.logs.ros_topics import Topics
@@ -24,7 +23,7 @@ __all__ = ["Columns", "Log", "Topics", "read_log", "write_log"]
 __getattr__, __dir__, _ = lazy_loader.attach(  # a process that only opens files needs none of these
     __name__,
     submod_attrs={
-        "column_map": ["Columns"],
+        "columns": ["Columns"],
         "log": ["Log"],
         "read": ["read_log", "write_log"],
         "ros_topics": ["Topics"],

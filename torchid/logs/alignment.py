@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -14,10 +15,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, excerpt, warn_about_file
 from torchid.logs.arrays import parse_names
-from torchid.logs.column_entries import KEY
-from torchid.logs.column_map import Columns
-from torchid.logs.column_matching import columns_by_file
-from torchid.logs.columns import KINDS, names_field
+from torchid.logs.columns import KEY, KINDS, Columns, names_field
 from torchid.logs.containers import LogKind, existing_log_kind, open_container
 from torchid.logs.gaps import refuse_gaps
 from torchid.logs.log import (
@@ -33,9 +31,9 @@ from torchid.logs.log import (
     parse_time,
     to_float64,
 )
-from torchid.logs.name_matching import words_of
 from torchid.logs.quaternion import make_sign_continuous
-from torchid.logs.tables import sample_table
+from torchid.logs.schema import columns_by_file
+from torchid.logs.tables import table_names
 from torchid.logs.time_range import LogFile
 from torchid.logs.timeline import JITTER, LONGEST_STEP, spline_derivatives
 
@@ -182,10 +180,10 @@ def own_stamps(values: NDArray[Any] | None, name: str, stamps: Mapping[str, NDAr
         stamps: (K,) each.
     """
     as_many = [] if values is None else [one for one, time in stamps.items() if len(time) == len(values)]
-    words = words_of(name)
+    words = re.findall("[a-z]+", name.lower())
 
     def alike(one: str) -> int:
-        return len(os.path.commonprefix([words_of(one), words]))
+        return len(os.path.commonprefix([re.findall("[a-z]+", one.lower()), words]))
 
     return max(as_many or [next(iter(stamps))], key=alike)
 
@@ -193,20 +191,52 @@ def own_stamps(values: NDArray[Any] | None, name: str, stamps: Mapping[str, NDAr
 def _joined(labels: Sequence[str], parts: Sequence[Fields], files: Sequence[str] = ()) -> Fields:
     """The fields of all parts of a log at the stamps of the first; `files`: that they are in, if in several.
 
-    A field may be in several parts, each with joints, contacts or sensors of its own.
+    A field may be in several parts, each with joints, contacts or sensors of its own; their order is that of the parts
+    that have them.
     """
-    _require_once(labels, parts)
     time = _common_stamps(labels, [part["time"] for part in parts])
-    names = _all_names(parts)
-    pieces = dict[str, list[_Piece]]()
-    for part, file in zip(parts, files or [""] * len(parts), strict=True):
-        with about_file(file) if file else nullcontext():
+    names: dict[str, list[str]] = {}
+    for of in NAME_FIELDS:
+        every = [name for part in parts if of in part for name in part[of].tolist()]
+        names |= {of: list(dict.fromkeys(every))} if every else {}
+    pieces = dict[str, list[tuple[str, list[str], NDArray[Any]]]]()
+    for number, part in enumerate(parts):
+        with about_file(files[number]) if files else nullcontext():
             fields = {name: x for name, x in part.items() if name not in NAME_FIELDS}
             for name, values in _aligned(fields, time, parts[0]["time"][0]).items():
-                of = names_field(name)
-                pieces.setdefault(name, []).append(_Piece(file, part.get(of, np.array(names.get(of, []))), values))
-    out = {name: _in_order(name, of, names.get(names_field(name), [])) for name, of in pieces.items()}
+                own = part[names_field(name)].tolist() if names_field(name) in part else []
+                pieces.setdefault(name, []).append((labels[number], own, values))
+    out = {name: _side_by_side(name, of, names.get(names_field(name), []), files) for name, of in pieces.items()}
     return out | {name: np.array(of, dtype=np.str_) for name, of in names.items()} | {"time": time}
+
+
+def _side_by_side(
+    field: str, pieces: Sequence[tuple[str, list[str], NDArray[Any]]], names: list[str], files: Sequence[str]
+) -> NDArray[Any]:
+    """A field with its columns in the order of the log's names, those of several files side by side.
+
+    Raises:
+        LogError: a field in two files that have the same joints, contacts or sensors of it, or none; or one of these
+            that is in no file.
+    """
+    own = [name for _, of_file, _ in pieces for name in of_file]
+    if len(pieces) > 1 and (len(set(own)) < len(own) or not all(of_file for _, of_file, _ in pieces)):
+        found = f"both in {pieces[0][0]} and in {pieces[1][0]}"
+        accepted = "every field but time in one of several files, or other joints or contacts in each"
+        raise LogError.at_field(field, found, accepted)
+    values = np.concatenate([x for *_, x in pieces], axis=1) if len(pieces) > 1 else pieces[0][2]
+    own = own or names
+    if own == names or values.ndim < 2:
+        return values
+    if missing := sorted(set(names) - set(own)):
+        of = names_field(field)
+        file = next((file for file in files if file.endswith(pieces[-1][0])), "")
+        with about_file(file) if file else nullcontext():
+            accepted = (
+                f"the same {KINDS[of]}s in all files of a log, or in those that have {field} together, in any order"
+            )
+            raise LogError.at_field(of, f"'{missing[0]}' missing", accepted)
+    return np.asarray(values[:, [own.index(name) for name in names]])
 
 
 def _maps(paths: Sequence[Path], columns: Columns | None) -> list[Columns | None]:
@@ -221,13 +251,13 @@ def _maps(paths: Sequence[Path], columns: Columns | None) -> list[Columns | None
     for path in paths:
         with about_file(os.fspath(path)):
             given.append(_names_in(path))
-    return columns_by_file(columns, given, [path.name for path in paths])
+    return [*columns_by_file(columns, given, [path.name for path in paths])]
 
 
 def _names_in(path: Path) -> list[str]:
     """Columns of a table, or names of the arrays of a file."""
     if existing_log_kind(path) is LogKind.TABLE:
-        return list(sample_table(path))
+        return table_names(path)[0]
     with open_container(path) as container:
         return list(container.declared_bytes())
 
@@ -247,22 +277,6 @@ def _stamped(raw: Fields, shift_s: float) -> Fields:
     return out | {"time": time + shift_s if shift_s else time}
 
 
-def _require_once(labels: Sequence[str], parts: Sequence[Fields]) -> None:
-    """Refuse a field of two files, unless each has other joints, contacts or sensors of it."""
-    owners: dict[str, tuple[str, set[str]]] = {}
-    for label, part in zip(labels, parts, strict=True):
-        for name in part:
-            own = set(part[of].tolist()) if (of := names_field(name)) in part else set[str]()
-            if name in owners and name not in ("time", *NAME_FIELDS):
-                other, known = owners[name]
-                if not own or not known or own & known:
-                    found = f"both in {other} and in {label}"
-                    accepted = "every field but time in one of several files, or other joints or contacts in each"
-                    raise LogError.at_field(name, found, accepted)
-                own |= known
-            owners[name] = (label, own)
-
-
 def _common_stamps(labels: Sequence[str], stamps: Sequence[FloatArray]) -> FloatArray:
     """The stamps of the first file within the time that all cover."""
     time = stamps[0]
@@ -276,40 +290,6 @@ def _common_stamps(labels: Sequence[str], stamps: Sequence[FloatArray]) -> Float
         found += f"{labels[early]} ends at {stamps[early][-1]:.6f} s"
         raise LogError.at_field("time", found, "stamps of one clock, or shift_s, what is added to those of a file")
     return common
-
-
-def _all_names(parts: Sequence[Fields]) -> dict[str, list[str]]:
-    """Names of joints, contacts and sensors in the order of the files that have them."""
-    fields = [field for field in NAME_FIELDS if any(field in part for part in parts)]
-    every = {field: [name for part in parts if field in part for name in part[field].tolist()] for field in fields}
-    return {field: list(dict.fromkeys(names)) for field, names in every.items()}
-
-
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """What a file has of a field: `names` of the joints, contacts or sensors of its columns."""
-
-    file: str
-    names: NDArray[Any]
-    values: NDArray[Any]
-
-
-def _in_order(field: str, pieces: Sequence[_Piece], names: list[str]) -> NDArray[Any]:
-    """A field with its columns in the order of the log's names, those of several files side by side.
-
-    Raises:
-        LogError: a joint, contact or sensor of another field is in none of them.
-    """
-    own = [name for piece in pieces for name in piece.names.tolist()]
-    values = np.concatenate([x.values for x in pieces], axis=1) if len(pieces) > 1 else pieces[0].values
-    if own == names or values.ndim < 2:
-        return values
-    if missing := sorted(set(names) - set(own)):
-        of = names_field(field)
-        with about_file(pieces[-1].file) if pieces[-1].file else nullcontext():
-            accepted = f"the same {KINDS[of]}s in all files of a log, or in those that have {field} together"
-            raise LogError.at_field(of, f"'{missing[0]}' missing", f"{accepted}, in any order")
-    return np.asarray(values[:, [own.index(name) for name in names]])
 
 
 def _aligned(part: Fields, time: FloatArray, origin: float) -> Fields:

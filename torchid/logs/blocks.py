@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, excerpt
 from torchid.logs.arrays import lazy_part, parse_names, require_plain
-from torchid.logs.column_map import Columns
+from torchid.logs.columns import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.force_plates import about_world_origin
 from torchid.logs.gaps import bridge_gaps
@@ -30,8 +30,8 @@ from torchid.logs.log import (
     field_shape,
     to_float64,
 )
-from torchid.logs.mapped_fields import map_arrays
 from torchid.logs.read import build_log, check_fields_given
+from torchid.logs.schema import match_arrays
 from torchid.logs.table_files import is_text_table
 from torchid.logs.tables import read_table, table_blocks, table_size
 from torchid.logs.time_range import split_range
@@ -157,13 +157,10 @@ def _open_arrays(
     given = list(container.declared_bytes())
     if columns is not None and columns.episodes is not None:
         raise LogError.at_field("file", "episodes side by side, read whole", _WHOLE)
-    mapped = None if columns is None else map_arrays(columns, given, load)
-    check_fields_given(given if mapped is None else mapped.given, needs_flags)
-    if mapped is not None and (others := list(mapped.other_times(given))):
+    mapped = match_arrays(columns, given, load)
+    check_fields_given(mapped.given, needs_flags)
+    if others := list(mapped.other_times(given)):
         raise LogError.at_field("file", f"stamps beside those of time ('{excerpt(others[0])}'), read whole", _WHOLE)
-    if mapped is None:
-        text = [name for name in given if _is_text(name)]
-        return {name: load(name) for name in text}, {name: lazy(name) for name in given if name not in text}
     sources = dict.fromkeys(source for name in mapped.fields for source in mapped.sources_of(name))
     arrays = {source: lazy_part(source, given, lazy) for source in sources}
     fields: dict[str, LazyArray] = {}

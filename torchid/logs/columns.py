@@ -1,209 +1,59 @@
-"""Columns of a table, one per scalar: their names, which field each belongs to, and their values.
-
-pyarrow is passed in by `torchid.logs.tables`.
-"""
+"""What foreign columns and arrays hold: `logs.columns` of an experiment file, its entries and their checks."""
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
+from functools import partial
+from typing import Annotated, Any, Literal, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field
+from pydantic.dataclasses import dataclass
 
-from torchid.errors import LogError, excerpt, is_plain
-from torchid.guards import MAX_COLUMNS, check_names
-from torchid.guards import MAX_LETTERS as MAX_NAME
-from torchid.logs.log import (
-    FLAG_ACCEPTED,
-    FLAG_WORDS,
-    NAME_FIELDS,
-    SHAPES,
-    VARIANTS,
-    UnknownFieldError,
-    field_shape,
-    is_quaternion,
-)
-from torchid.logs.name_matching import is_foreign, unknown_columns
+from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt, join_names
+from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS, WRENCHES, UnknownFieldError, field_shape, is_quaternion
+from torchid.logs.unitree import order_by_name, require_joints_of, robot_with_order
+from torchid.logs.units import quantities_of, unit_factor
 from torchid.parameters import WRENCH_COMPONENTS
+from torchid.settings import STRICT, Name, Number, Positive
 
-#: The one column of text: the same in every row.
-TEXT_COLUMN = "imu_frame"
+KEY = "logs.columns"
+FILL_IN = "FILL_IN"
+"""What `torchid init` writes where a person has to say something."""
+
 COLUMN_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
-#: Characters in the name of a column, which contains that of a joint.
-MAX_COLUMN_LETTERS = 2 * MAX_NAME
+"""Fields of a log that columns of a table may have."""
 
-_UNIT = re.compile(r"\[.*\]$|\(.*\)$")
 KINDS = {"joint_names": "joint", "contact_names": "contact", "ft_names": "sensor"}
+PLACEHOLDER = re.compile(r"\{([^{}:]*)(?::(0\d))?\}")
+"""`{joint}`, `{index}`, `{index:02}`, `{axis}`, `{AXIS}`."""
 
+AXES = ("axis", "AXIS", "component")
+MOST_LISTED = 12
+"""Names that a message lists."""
 
-@dataclass(frozen=True)
-class _Column:
-    """One scalar: its field and, where the field has them, the name and the component."""
+_UNNAMED = re.compile(r"column_\d+")  # of a table of text that has no line of names, by their place
+OF_FILE = "::"
+"""Between the name of a file and that of a column that others have, too."""
 
-    field: str
-    name: str = ""
-    component: str = ""
-
-    def __str__(self) -> str:
-        return ".".join(part for part in (self.field, self.name, self.component) if part)
-
-
-@dataclass(frozen=True)
-class TableLayout:
-    """Columns of each field of a table.
-
-    Attributes:
-        names: names of joints, contacts and sensors, by field.
-        columns: by field, its columns in the order of its elements.
-    """
-
-    names: dict[str, tuple[str, ...]]
-    columns: dict[str, tuple[str, ...]]
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """All columns."""
-        return tuple(column for columns in self.columns.values() for column in columns)
-
-    @property
-    def flags(self) -> tuple[str, ...]:
-        """Columns that may hold true and false."""
-        return self.columns.get("contact_active", ())
-
-    def read(self, take: Callable[[str], NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """The arrays of a log file; `take` returns the values (N,) of a column and is called once for each."""
-        out: dict[str, NDArray[Any]] = {name: np.array(names, dtype=np.str_) for name, names in self.names.items()}
-        for field, columns in self.columns.items():
-            taken = [take(column) for column in columns]
-            out[field] = taken[0] if field == TEXT_COLUMN else self.field(field, taken)
-        return out
-
-    def field(self, name: str, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        """A field (N, ...) of the values (N,) of its columns."""
-        flat = np.stack(columns, axis=-1)
-        sizes = {letter: len(self.names.get(field, ())) for field, letter in NAME_FIELDS.items()}
-        shape = [sizes[x] if isinstance(x, str) else x for x in field_shape(name)[1:]]
-        return flat.reshape(len(flat), *shape)
-
-
-def parse_header(texts: Sequence[str], named: Mapping[str, tuple[str, ...]] | None = None) -> TableLayout:
-    """Sort the columns of a table into fields.
-
-    Joints, contacts and sensors are named by the columns of the first of their fields; the others have the same.
-
-    Args:
-        texts: the columns.
-        named: names of joints, contacts and sensors by field, where they are known already.
-
-    Raises:
-        LogError: a column is missing, or some are unknown: all of these are named at once.
-    """
-    given: dict[str, dict[str, _Column]] = {}
-    unknown: dict[str, LogError] = {}
-    for text in texts:
-        try:
-            column = _parse_column(text)
-        except LogError as error:
-            unknown[text] = error
-        else:
-            given.setdefault(column.field, {})[text] = column
-    if unknown:
-        (name, failure), *others = unknown.items()
-        raise unknown_columns(list(unknown)) if others or is_foreign(name) else failure
-    names: dict[str, tuple[str, ...]] = dict(named or {})
-    for field in COLUMN_FIELDS:
-        of = names_field(field)
-        if of and of not in names and field in given:
-            names[of] = tuple(dict.fromkeys(column.name for column in given[field].values()))
-    columns = {field: column_names(field, names) for field in given}
-    for field, expected in columns.items():
-        _check_complete(field, expected, given[field])
-    return TableLayout({"joint_names": (), **names}, columns)
-
-
-def check_header(texts: Sequence[str]) -> None:
-    """Raise LogError for too many columns, and names that are too long, of control characters, or given twice."""
-    if len(texts) > MAX_COLUMNS:
-        raise LogError.at_field("file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
-    seen = set[str]()
-    for text in texts:
-        if len(text) > MAX_COLUMN_LETTERS or not is_plain(text):
-            found = f"a name of {len(text)} characters: {excerpt(text)}"
-            raise LogError.at_field("header", found, f"names of one line and at most {MAX_COLUMN_LETTERS} characters")
-        if text in seen:
-            raise LogError.at_field(f"column '{text}'", "given twice", "every column once")
-        seen.add(text)
-
-
-def is_column(text: str) -> bool:
-    """Whether a column has a name of the log format."""
-    try:
-        _parse_column(text)
-    except LogError:
-        return False
-    return True
-
-
-def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, _Column]) -> None:
-    missing = [text for text in expected if text not in given]
-    if missing:
-        accepted = f"every column of {_column_pattern(field)}; a cell may be empty where nothing was measured"
-        raise LogError.at_field(f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
-    extra = list(given.keys() - set(expected))
-    if extra:
-        found = f"a {KINDS[names_field(field)]} that the first field of its kind does not name"
-        raise LogError.at_field(f"column '{extra[0]}'", found, "the same names in all fields")
-
-
-def _parse_column(text: str) -> _Column:
-    """The parts of a column's name: the field up to its first dot, a component after its last.
-
-    Raises:
-        LogError: no column has such a name.
-    """
-    field, _, rest = text.partition(".")
-    if _UNIT.search(text):
-        raise LogError.at_field(f"column '{text}'", "a unit in its name", "names without units, values in SI units")
-    if field not in COLUMN_FIELDS:
-        raise UnknownFieldError.at_field(f"column '{text}'", field, COLUMN_FIELDS)
-    components, of = component_names(field), names_field(field)
-    if of and components:
-        name, _, component = rest.rpartition(".")
-    else:
-        name, component = (rest, "") if of else ("", rest)
-    column = _Column(field, name, component)
-    if str(column) != text or bool(name) != bool(of) or (component not in components if components else component):
-        raise LogError.at_field(f"column '{text}'", "no such part of this field", _column_pattern(field))
-    return column
-
-
-def column_names(field: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-    """The columns of a field in the order of its elements; `names` by field."""
-    of = names_field(field)
-    return tuple(
-        str(_Column(field, name, component))
-        for name in (names[of] if of else ("",))
-        for component in component_names(field) or ("",)
-    )
+Names = list[Name]
+_X = TypeVar("_X")
+_Three = tuple[Number, Number, Number]
+_GAINS = ("value", "column", "columns", "order", "first_index")
+_XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")
 
 
 def component_names(field: str) -> tuple[str, ...]:
-    """Possible last parts of a column's name; none for fields without components."""
+    """Names of the components of a field; none for fields without components."""
     size = field_shape(field)[-1] if len(field_shape(field)) > 1 else None
     if size == 6:
         return WRENCH_COMPONENTS
     if is_quaternion(field):
         return tuple(field.rpartition("_")[2])
-    return ("x", "y", "z") if size == 3 else ()
-
-
-def _column_pattern(field: str) -> str:
-    """Pattern of a field's column names, such as `ft_wrench.<sensor>.{fx, fy, fz, mx, my, mz}`."""
-    of, components = names_field(field), component_names(field)
-    return str(_Column(field, f"<{KINDS[of]}>" if of else "", f"{{{', '.join(components)}}}" if components else ""))
+    return _XYZ if size == 3 else ()
 
 
 def names_field(field: str) -> str:
@@ -212,86 +62,591 @@ def names_field(field: str) -> str:
     return next((name for name, of in NAME_FIELDS.items() if of == letter), "")
 
 
-def to_columns(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The columns (N,) of a log's fields, by name.
+def format_pattern(field: str) -> str:
+    """The pattern of torchid's own columns of a field, such as `ft_wrench.{sensor}.{axis}`."""
+    kind = f".{{{KINDS[names_field(field)]}}}" if names_field(field) else ""
+    return field + kind + (".{axis}" if component_names(field) else "")
+
+
+def unknown_columns(columns: Sequence[str], has_map: bool) -> LogError:
+    """The error of columns or arrays that neither the log format nor a map knows, all in one line."""
+    field = columns[0].partition(".")[0]
+    if has_map:
+        accepted = f"an entry for each column, or its name in {KEY}.ignore"
+        return LogError.at_field(KEY, f"no entry for {join_names(columns, MOST_LISTED)}", accepted)
+    if len(columns) == 1 and field in COLUMN_FIELDS and "[" not in columns[0]:
+        accepted = format_pattern(field).replace("{axis}", "{" + ", ".join(component_names(field)) + "}")
+        return LogError.at_field(f"column '{columns[0]}'", "no such part of this field", accepted)
+    is_misspelt = field not in COLUMN_FIELDS and difflib.get_close_matches(field, COLUMN_FIELDS, cutoff=0.6)
+    if len(columns) == 1 and is_misspelt:
+        return UnknownFieldError.at_field(f"column '{columns[0]}'", field, COLUMN_FIELDS)
+    found = f"{len(columns)} unknown: {join_names(columns, MOST_LISTED)}"
+    if all(map(_UNNAMED.fullmatch, columns)):
+        found = f"{len(columns)} of numbers without a line of names"
+    accepted = "names of the log format, or logs.columns of an experiment file, which says what they hold"
+    return LogError.at_field("columns", found, f"{accepted}; torchid init writes one")
+
+
+# --------------------------------------------------------------------------------------------------- entries of a map
+
+
+def for_all(value: Any) -> Any:
+    """A map of values by pattern, where one value is for all names."""
+    return value if isinstance(value, Mapping) else {"*": value}
+
+
+def _column(value: object) -> object:
+    return {"column": value} if isinstance(value, str) else value
+
+
+def _gains(value: object) -> object:
+    if isinstance(value, str):
+        return {"column": value}
+    if isinstance(value, Gains) or (isinstance(value, Mapping) and set(value) & set(_GAINS)):
+        return value
+    return {"value": value}
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class ColumnEntry:
+    """The columns, or the array, of one field.
+
+    Attributes:
+        column: its name, or a pattern: `{joint}`, `{contact}` or `{sensor}` stands for a name, `{index}` for the number
+            of one in `order` (or of a component), `{axis}` for a component (x, y, z; w, x, y, z; fx to mz), `{AXIS}`
+            for the same in capitals.
+        columns: by name or component, its column, in place of a pattern.
+        order: names, by number; null for a number that is no joint (contact, sensor) of the robot.
+        first_index: number of the first of them.
+        unit: by pattern of a name or component, or one for all; SI units by default.
+        scale: what numbers are multiplied by, likewise: -1 turns a sign.
+    """
+
+    column: Name | None = None
+    columns: dict[Name, Name] = dataclasses.field(default_factory=dict)
+    order: Annotated[list[Name | None], Field(min_length=1)] | None = None
+    first_index: int = 0
+    unit: Annotated[dict[str, Name], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
+    scale: Annotated[dict[str, Number], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
+
+
+FRACTIONS = {"nanoseconds": "ns", "microseconds": "us"}
+"""Units of what may be added to whole seconds, by key."""
+
+Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class TimeEntry(ColumnEntry):
+    """Stamps as a column.
+
+    Attributes:
+        nanoseconds, microseconds: column of what is added to it [ns, us], of stamps in two columns.
+        step: in place of a column, how much later each sample is than the one before, in the unit.
+    """
+
+    nanoseconds: Name | None = None
+    microseconds: Name | None = None
+    step: Positive | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class AngleEntry(ColumnEntry):
+    """Positions of joints; `turn_from`: where the turn begins that angles are counted in, in their unit.
+
+    Of an encoder that jumps from 359 to 0 deg, -180 makes 359 deg -1 deg.
+    """
+
+    turn_from: Annotated[dict[str, Number], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class QuaternionEntry(ColumnEntry):
+    """The base's orientation as columns of a quaternion.
+
+    Attributes:
+        rpy: in its place, angles (roll, pitch, yaw) as a URDF has them: about the world's x, then y, then z.
+    """
+
+    rpy: Entry | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class Gains(ColumnEntry):
+    """Gains [N m/rad, N m s/rad]: `value` by pattern of the joint or one for all, or columns, or an array (n,)."""
+
+    value: Annotated[dict[str, Number], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
+
+
+GainsEntry = Annotated[Gains, BeforeValidator(_gains)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class PdLaw:
+    """kp (position - q) + kd (velocity - dq) + feed_forward, with desired values; what is not given is 0."""
+
+    kp: GainsEntry | None = None
+    kd: GainsEntry | None = None
+    position: Entry | None = None
+    velocity: Entry | None = None
+    feed_forward: Entry | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class CurrentEntry(ColumnEntry):
+    """Currents of motors as columns [A], of which torques are made.
+
+    Attributes:
+        torque_constant: by pattern of the joint or one for all, torque of the motor for its current [N m/A].
+        gear_ratio: likewise, turns of the motor for one of the joint (radians for a metre of a slide).
+    """
+
+    torque_constant: Annotated[dict[str, Number], BeforeValidator(for_all)]
+    gear_ratio: Annotated[dict[str, Number], BeforeValidator(for_all)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class TorqueEntry(ColumnEntry):
+    """Torques as columns, of a PD law, or of the currents of motors."""
+
+    pd: PdLaw | None = None
+    current: CurrentEntry | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class FlagEntry(ColumnEntry):
+    """Contact flags as columns.
+
+    Attributes:
+        above: contacts are active where the number is above this, in its unit; without columns that of the contact's
+            force [N].
+        always: contacts that are active throughout, in place of columns.
+    """
+
+    above: Number | None = None
+    always: Names = dataclasses.field(default_factory=list)
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class VectorEntry(ColumnEntry):
+    """Moments or points as columns of their components; `axes`: those that have one, others are 0."""
+
+    axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1)] | None = None
+
+
+Vector = Annotated[VectorEntry, BeforeValidator(_column)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class WrenchEntry(ColumnEntry):
+    """Wrenches as columns of all components, or forces and moments each for themselves (x, y, z); no moments: NaN."""
+
+    force: Entry | None = None
+    moment: Vector | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class Plate:
+    """Pose of a force plate, of the axes and the origin that its readings have, in the world.
+
+    Attributes:
+        position: [m], of the origin.
+        rpy_deg: [deg], roll, pitch and yaw of the axes as in a URDF: about the world's x, then y, then z.
+    """
+
+    position: _Three = (0.0, 0.0, 0.0)
+    rpy_deg: _Three = (0.0, 0.0, 0.0)
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class Episodes:
+    """Recordings side by side in a file of arrays, which become one after the other.
+
+    Attributes:
+        axis: of arrays, that counts them: 0 of (episodes, samples, ...), 1 of (samples, episodes, ...).
+        lengths: array with the number of samples of each, where arrays are filled up behind these.
+        groups: in place of an axis, name of the groups that hold one each, with * for their number: `data/demo_*`.
+    """
+
+    axis: Literal[0, 1] = 0
+    lengths: Name | None = None
+    groups: Name | None = None
+
+
+Stamps = Annotated[TimeEntry, BeforeValidator(_column)]
+Quaternion = Annotated[QuaternionEntry, BeforeValidator(_column)]
+Angle = Annotated[AngleEntry, BeforeValidator(_column)]
+Torque = Annotated[TorqueEntry, BeforeValidator(_column)]
+Flags = Annotated[FlagEntry, BeforeValidator(_column)]
+Wrench = Annotated[WrenchEntry, BeforeValidator(_column)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class Columns:
+    """What the columns of a table, or the arrays of a file, hold; those with names of the log format need no entry.
+
+    Keys are the fields of a log, and:
+
+    Attributes:
+        imu_frame: the frame of the URDF that the IMU sits at: no column, but the name itself.
+        other_times: entries like `time`, for files without its column.
+        joint_order: names of joints by number, for entries without `order`, or the robot whose order it is (`go2`);
+            `contact_order`, `sensor_order`: as well.
+        joint_name: what the joint that the file calls {joint} is called in the URDF, such as `{joint}_joint`.
+        contact_name: as well, of {contact}.
+        plates: by pattern of the contact, pose of the force plate whose axes and origin `contact_wrench_world` and
+            `contact_wrench_point_world` have.
+        rows_of: the column that names the joint of a row, of a table with a row for each joint at each stamp: its
+            other columns are then `position.l_knee`, ...
+        episodes: where recordings lie side by side in arrays, or in groups of these.
+        ignore: columns that are not needed; * and ? stand for others.
+    """
+
+    time: Stamps | None = None
+    other_times: list[Entry] = dataclasses.field(default_factory=list)
+    joint_position: Angle | None = None
+    joint_velocity: Entry | None = None
+    joint_acceleration: Entry | None = None
+    joint_torque: Torque | None = None
+    base_quat_xyzw: Quaternion | None = None
+    base_quat_wxyz: Quaternion | None = None
+    base_position_world: Entry | None = None
+    base_linear_velocity_world: Entry | None = None
+    base_linear_velocity_base: Entry | None = None
+    base_angular_velocity_base: Entry | None = None
+    base_angular_velocity_world: Entry | None = None
+    base_linear_acceleration_world: Entry | None = None
+    base_linear_acceleration_base: Entry | None = None
+    base_angular_acceleration_base: Entry | None = None
+    base_angular_acceleration_world: Entry | None = None
+    contact_active: Flags | None = None
+    contact_wrench_local: Wrench | None = None
+    contact_wrench_world: Wrench | None = None
+    contact_wrench_point_world: Vector | None = None
+    contact_normal_world: Entry | None = None
+    contact_force_normal: Entry | None = None
+    ft_wrench: Wrench | None = None
+    imu_frame: Name | None = None
+    imu_specific_force: Entry | None = None
+    imu_angular_velocity: Entry | None = None
+    imu_angular_acceleration: Entry | None = None
+    joint_order: Annotated[list[Name | None], BeforeValidator(partial(order_by_name, "joint"))] | None = None
+    contact_order: Annotated[list[Name | None], BeforeValidator(partial(order_by_name, "contact"))] | None = None
+    sensor_order: list[Name | None] | None = None
+    joint_name: Name = "{joint}"
+    contact_name: Name = "{contact}"
+    plates: dict[Name, Plate] = dataclasses.field(default_factory=dict)
+    rows_of: Name | None = None
+    episodes: Episodes | None = None
+    ignore: Names = dataclasses.field(default_factory=list)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields of a log that have an entry."""
+        return tuple(name for name, entry in vars(self).items() if isinstance(entry, ColumnEntry))
+
+    def order_of(self, entry: ColumnEntry, kind: str) -> list[str | None] | None:
+        """Names by number, of an entry for a kind of names (`joint`, ...)."""
+        return entry.order or getattr(self, f"{kind}_order")
+
+    def name_of(self, kind: str) -> str:
+        """The pattern of the URDF's names of a kind."""
+        return str(getattr(self, f"{kind}_name", f"{{{kind}}}"))
+
+
+def fits(name: str, pattern: str) -> bool:
+    """Whether a name fits a pattern, in which * and ? stand for other letters and brackets for themselves."""
+    return fnmatchcase(name, pattern.replace("[", "[[]"))
+
+
+def letters_of(pattern: str) -> int:
+    """How much a pattern says: of several that a name fits, the one with most letters counts."""
+    return len(re.sub(r"[*?]", "", PLACEHOLDER.sub("", pattern)))
+
+
+def values_by_name(key: str, given: Mapping[str, _X], labels: Sequence[str]) -> dict[str, _X]:
+    """Values by name, of values by pattern: that with most letters counts.
 
     Raises:
-        LogError: a name that no column can have, or names without any values.
+        ConfigError: two that say as much.
+        UnknownNameError: a pattern that no name fits.
     """
-    names = {name: tuple(map(str, arrays[name])) for name in NAME_FIELDS if name in arrays}
-    columns: dict[str, NDArray[Any]] = {}
-    for field, array in arrays.items():
-        if field in NAME_FIELDS:
-            continue
-        if field == TEXT_COLUMN:
-            columns[field] = np.full(len(arrays["time"]), str(array))
-            continue
-        flat = array.reshape(len(array), -1)
-        for j, text in enumerate(column_names(field, names)):
-            if text != text.strip():
-                raise LogError.at_field(f"column '{text}'", "a space at its end", "names without")
-            columns[text] = flat[:, j]
-    check_header(list(columns))
-    layout = parse_header(list(columns))
-    for name, given in names.items():
-        if given and layout.names.get(name) != given:
-            raise LogError.at_field(name, "names without any values", "a .npz or .h5 file, or a field of them")
-    return columns
+    out: dict[str, tuple[int, _X]] = {}
+    for pattern, value in given.items():
+        letters, found = letters_of(pattern), [label for label in labels if fits(label, pattern)]
+        if not found and letters:
+            raise UnknownNameError.at_field(key, excerpt(pattern), labels)
+        for label in found:
+            most = out.get(label, (-1, value))
+            if most[0] == letters and most[1] != value:
+                raise ConfigError.at_field(key, f"two values of {label}", "patterns of which one has more letters")
+            out[label] = max(most, (letters, value), key=lambda pair: pair[0])
+    return {label: value for label, (_, value) in out.items()}
 
 
-_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+def values_of_all(key: str, what: str, given: Mapping[str, _X], kind: str, labels: Sequence[str]) -> list[_X]:
+    """Values of all names, of values by pattern; errors as `values_by_name`, and ConfigError for a name without one."""
+    found = values_by_name(key, given, labels)
+    without = [label for label in labels if label not in found]
+    if without:
+        raise ConfigError.at_field(key, f"no {what} of {without[0]}", f"one for every {kind}; * stands for all others")
+    return [found[label] for label in labels]
 
 
-def is_number(pa: Any, type_: Any) -> bool:
-    """Whether a type is that of numbers, or true and false."""
-    return bool(pa.types.is_integer(type_) or pa.types.is_floating(type_) or pa.types.is_boolean(type_))
+@dataclasses.dataclass(frozen=True)
+class EntryPart:
+    """A field of a log, or a part that it is computed from, as one entry gives it.
+
+    Attributes:
+        key: below `logs.columns`.
+        entry: of the map.
+        names_field: `joint_names`, ... or "" without names.
+        components: `x`, ...; none for one number each.
+        quantities: by component that its unit may be of, as `quantities_of` says; of one number under "".
+        is_native: whether its columns have torchid's own names, without an entry in the map.
+    """
+
+    key: str
+    entry: ColumnEntry
+    names_field: str
+    components: tuple[str, ...]
+    quantities: Mapping[str, tuple[str, ...]]
+    is_native: bool = False
+
+    @property
+    def kind(self) -> str:
+        """Word for one of its names: joint, contact or sensor; "" without names."""
+        return KINDS.get(self.names_field, "")
+
+    @property
+    def where(self) -> str:
+        """What messages call it."""
+        return self.key if self.is_native else f"{KEY}.{self.key}"
+
+    @property
+    def patterns(self) -> list[str]:
+        """Patterns of its columns."""
+        return [text for text in (self.entry.column, *self.entry.columns.values()) if text]
 
 
-def is_stamp(pa: Any, type_: Any) -> bool:
-    """Whether a type is that of dates or times of day."""
-    return bool(pa.types.is_timestamp(type_) or pa.types.is_time(type_) or pa.types.is_duration(type_))
+def _part(key: str, field: str, entry: ColumnEntry) -> EntryPart:
+    """An entry that is like a field of a log."""
+    components = tuple(getattr(entry, "axes", None) or component_names(field))
+    has_unit = not isinstance(entry, (FlagEntry, Gains))
+    quantities = {name: quantities_of(field, name) if has_unit else () for name in components or ("",)}
+    return EntryPart(key, entry, names_field(field), components, quantities)
 
 
-def to_numbers(pa: Any, values: Any) -> NDArray[Any]:
-    """Numbers (N,) of a column: of dates seconds since 1970, of times of day since midnight, NaN for empty cells."""
-    if not is_stamp(pa, values.type):
-        return np.asarray(values.to_numpy(False))
-    whole = np.asarray(values.cast(pa.int32() if values.type.bit_width == 32 else pa.int64()).to_numpy(False))
-    return whole / _PER_SECOND[values.type.unit]
+def native_part(field: str) -> EntryPart:
+    """The entry of a field whose columns in a table have torchid's own names."""
+    kind = FlagEntry if field == "contact_active" else ColumnEntry
+    return dataclasses.replace(_part(field, field, kind(column=format_pattern(field))), is_native=True)
 
 
-def column_values(pa: Any, column: str, values: Any) -> NDArray[Any]:
-    """A column's values (N,), NaN for empty cells; for text, the common value of all rows."""
-    if not pa.types.is_dictionary(values.type):
-        if pa.types.is_boolean(values.type) and values.null_count:
-            values = values.cast(pa.float64())
-        return to_numbers(pa, values.combine_chunks())
-    values = values.unify_dictionaries()
-    words = values.unique().to_pylist()
-    if column == TEXT_COLUMN:
-        if len(words) != 1 or words[0] is None:
-            found = " and ".join("an empty cell" if word is None else f"'{excerpt(word)}'" for word in words[:2])
-            raise LogError.at_field(f"column '{column}'", found, "one name, the same in every row")
-        check_names([1], len(words[0]))
-        return np.array(words[0].strip())
-    numbers = {word: np.nan if word is None else _flag(column, word) for word in words}
-    coded = pa.array([numbers[word] for word in words])
-    codes = pa.compute.index_in(values.cast(pa.string()), pa.array(words, pa.string()))
-    return np.asarray(coded.take(codes.combine_chunks()).to_numpy(zero_copy_only=False))
+def list_parts(columns: Columns) -> dict[str, EntryPart]:
+    """All entries that have columns or arrays of their own, by key."""
+    parts: list[EntryPart] = []
+    for field in columns.fields:
+        entry = getattr(columns, field)
+        if entry.column or entry.columns:
+            parts.append(_part(field, field, entry))
+        for name, unit in FRACTIONS.items():
+            if column := getattr(entry, name, None):
+                parts.append(_part(f"{field}.{name}", "time", ColumnEntry(column=column, unit={"*": unit})))
+        for name, quantity in (("force", "force"), ("moment", "torque")):
+            if (inner := getattr(entry, name, None)) is not None:
+                axes = tuple(getattr(inner, "axes", None) or _XYZ)
+                quantities = dict.fromkeys(axes, (quantity,))
+                parts.append(EntryPart(f"{field}.{name}", inner, names_field(field), axes, quantities))
+        if (angles := getattr(entry, "rpy", None)) is not None:
+            parts.append(EntryPart(f"{field}.rpy", angles, "", _RPY, dict.fromkeys(_RPY, ("angle",))))
+        if isinstance(entry, TorqueEntry):
+            parts += _torque_parts(field, entry)
+    return {part.key: part for part in parts}
 
 
-def _flag(column: str, word: str) -> float:
-    try:
-        return float(FLAG_WORDS.get(word.strip().lower(), word.replace(",", ".")))
-    except ValueError as error:
-        raise LogError.at_field(f"column '{column}'", f"'{excerpt(word)}'", FLAG_ACCEPTED) from error
+def _torque_parts(field: str, entry: TorqueEntry) -> list[EntryPart]:
+    parts = []
+    if entry.current is not None:
+        parts.append(EntryPart(f"{field}.current", entry.current, names_field(field), (), {"": ("current",)}))
+    for name, like in _LAW.items():
+        inner = getattr(entry.pd, name, None)
+        if inner is not None and (inner.column or inner.columns):
+            parts.append(_part(f"{field}.pd.{name}", like, inner))
+    return parts
 
 
-def text_or_flags(values: Any) -> NDArray[Any] | None:
-    """The text (1,) that all rows of a column have, or flags (N,) of words that mean them; None of other texts."""
-    texts = values.unique().to_pylist()
-    flags = {text: np.nan if text is None else FLAG_WORDS.get(text.strip().lower()) for text in texts}
-    if None not in flags.values():
-        kind = np.float64 if None in texts else np.bool_
-        return np.array([flags[text] for text in values.to_pylist()], dtype=kind)
-    return np.array(texts) if len(texts) == 1 and texts[0] else None
+_LAW = {
+    "position": "joint_position", "velocity": "joint_velocity", "feed_forward": "joint_torque",
+    "kp": "joint_torque", "kd": "joint_torque",
+}  # fmt: skip
+"""What the parts of a PD law are like."""
+
+
+# --------------------------------------------------------------------------------------------------- checks of a map
+
+
+def check_columns(columns: Columns) -> None:
+    """Check whatever of a map does not depend on a file.
+
+    Raises:
+        ConfigError: an entry without columns or with two kinds of them, a placeholder that stands for nothing, a name
+            twice in an order, a unit that is none.
+    """
+    for kind in KINDS.values():
+        _check_order(f"{KEY}.{kind}_order", getattr(columns, f"{kind}_order"))
+    for kind in ("joint", "contact"):
+        if columns.name_of(kind).count(f"{{{kind}}}") != 1:
+            accepted = f"a pattern with {{{kind}}} once, such as {{{kind}}}_link"
+            raise ConfigError.at_field(f"{KEY}.{kind}_name", f"found '{excerpt(columns.name_of(kind))}'", accepted)
+    times = [("other_times", entry) for entry in columns.other_times]
+    for field, entry in (*((field, getattr(columns, field)) for field in columns.fields), *times):
+        _check_given(field, entry)
+    if columns.plates and columns.contact_wrench_world is None:
+        accepted = f"an entry of {WRENCHES[1]}, readings along the plates' axes, or no plates"
+        raise ConfigError.at_field(f"{KEY}.plates", f"given without {KEY}.{WRENCHES[1]}", accepted)
+    groups = None if columns.episodes is None else columns.episodes.groups
+    if groups is not None and (groups.count("*") != 1 or (columns.episodes and columns.episodes.lengths)):
+        accepted = "a name with one * for the number of a group, such as data/demo_*, without lengths"
+        raise ConfigError.at_field(f"{KEY}.episodes", f"groups: '{excerpt(groups)}'", accepted)
+    for part in (*list_parts(columns).values(), *(_part(name, "time", entry) for name, entry in times)):
+        _check_part(part)
+
+
+def _check_order(key: str, order: list[str | None] | None) -> None:
+    names = [name for name in order or () if name is not None]
+    again = [name for name in names if names.count(name) > 1]
+    if again:
+        raise ConfigError.at_field(key, f"'{excerpt(again[0])}' twice", "every name once, null for what is left out")
+    if order is not None and not names:
+        raise ConfigError.at_field(key, "no name", "names in the order of the columns")
+
+
+_WAYS = ("column", "columns", "pd", "current", "always", "force", "step", "rpy")
+"""Keys of an entry of which one says where its numbers are."""
+
+
+def _check_given(field: str, entry: ColumnEntry) -> None:
+    """Refuse an entry that says nothing, or the same in two ways."""
+    key = f"{KEY}.{field}"
+    given = [name for name in _WAYS if getattr(entry, name, None)]
+    if not given and getattr(entry, "above", None) is not None:
+        given = ["above"]
+    if len(given) != 1:
+        found = f"{' and '.join(given)} together" if given else "nothing that says where it is"
+        raise ConfigError.at_field(key, found, f"one of {', '.join(name for name in _WAYS if hasattr(entry, name))}")
+    (way,) = given
+    unsaid = (
+        "scale",
+        "order",
+        *FRACTIONS,
+        *(["unit"] if way != "step" else []),
+        *(["above"] if way != "above" else []),
+    )
+    beside = [name for name in unsaid if getattr(entry, name, None)] if way not in ("column", "columns") else []
+    if beside:
+        found = f"{beside[0]} beside {way}, which it says nothing about"
+        raise ConfigError.at_field(key, found, f"{way} without {beside[0]}")
+    if getattr(entry, "moment", None) is not None and way != "force":
+        raise ConfigError.at_field(key, "moment without force", "force, with or without moment")
+    if isinstance(entry, TorqueEntry) and entry.pd is not None:
+        _check_law(entry.pd)
+    if isinstance(entry, TorqueEntry) and entry.current is not None:
+        _check_given(f"{field}.current", entry.current)
+
+
+def _check_law(law: PdLaw) -> None:
+    key = f"{KEY}.joint_torque.pd"
+    if (law.kp is None) != (law.position is None):
+        found = "position without kp" if law.kp is None else "kp without position"
+        raise ConfigError.at_field(key, found, "kp together with position, the desired one")
+    if law.kd is None and (law.velocity is not None or law.kp is None):
+        found = "no gain" if law.velocity is None else "velocity without kd"
+        raise ConfigError.at_field(key, found, "kp with position, or kd with or without velocity, or both")
+    for name in ("kp", "kd"):
+        gains = getattr(law, name)
+        if gains is not None and bool(gains.value) + bool(gains.column) + bool(gains.columns) != 1:
+            accepted = "a number, numbers by joint, or a column or an array"
+            raise ConfigError.at_field(f"{key}.{name}", "not one of value, column and columns", accepted)
+
+
+def _check_part(part: EntryPart) -> None:
+    """Check patterns, names and units of an entry."""
+    key = f"{KEY}.{part.key}"
+    entry = part.entry
+    if entry.column and entry.columns:
+        raise ConfigError.at_field(key, "column and columns together", "one of the two")
+    _check_order(f"{key}.order", entry.order)
+    for text in part.patterns:
+        if text == FILL_IN:
+            accepted = "a name of a column, or a pattern; torchid init lists what the file has below its map"
+            raise ConfigError.at_field(key, f"{FILL_IN}, which is to be filled in", accepted)
+        _check_pattern(key, part, text)
+    if entry.columns and not part.kind and set(entry.columns) != set(part.components):
+        found = f"components {', '.join(entry.columns)}"
+        accepted = f"each of {', '.join(part.components)}" if part.components else "column, as it is one number"
+        raise ConfigError.at_field(f"{key}.columns", found, accepted)
+    quantities = tuple(dict.fromkeys(quantity for given in part.quantities.values() for quantity in given))
+    for unit in entry.unit.values():
+        unit_factor(f"{key}.unit", unit, quantities)
+
+
+def _check_pattern(key: str, part: EntryPart, text: str) -> None:
+    allowed = [*([part.kind] if part.kind else []), "index", *(AXES if part.components else ())]
+    found = [name for name, _ in PLACEHOLDER.findall(text)]
+    wrong = [name for name in found if name not in allowed or found.count(name) > 1]
+    if wrong or len({part.kind, "index"} & set(found)) > 1 or len(set(found) & set(AXES)) > 1:
+        accepted = f"at most one each of {', '.join(f'{{{x}}}' for x in allowed)}, and one of them for the names"
+        raise ConfigError.at_field(key, f"{{{(wrong or found)[0]}}} in '{excerpt(text)}'", accepted)
+
+
+def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> None:
+    """Make sure that all names which a map states are those of a robot.
+
+    Args:
+        columns: the map.
+        known: names by their kind: joint, contact.
+
+    Raises:
+        InputError: one that is not.
+    """
+    if (robot := robot_with_order(columns.joint_order)) and "joint" in known:
+        require_joints_of(f"{KEY}.joint_order", robot, known["joint"])
+    stated: list[tuple[str, str, Iterable[str | None]]]
+    stated = [(kind, f"{kind}_order", getattr(columns, f"{kind}_order") or ()) for kind in known]
+    for part in list_parts(columns).values():
+        stated.append((part.kind, f"{part.key}.order", part.entry.order or ()))
+        stated.append((part.kind, f"{part.key}.columns", part.entry.columns))
+    if columns.contact_active is not None:
+        stated.append(("contact", "contact_active.always", columns.contact_active.always))
+    for kind, key, names in stated:
+        given = [name for name in names if name is not None]
+        unknown = [name for name in given if kind in known and name not in known[kind]]
+        if len(unknown) > 1 and unknown == given:
+            found = f"none of {join_names(given)} is a {kind} of the robot; is it the one that was recorded?"
+            raise ConfigError.at_field(f"{KEY}.{key}", found, f"names of the robot: {join_names(list(known[kind]))}")
+        if unknown:
+            raise UnknownNameError.at_field(f"{KEY}.{key}", unknown[0], known[kind])
+
+
+def as_in_file(value: Any, file: str, others: Collection[str] = ()) -> Any:
+    """A map, or a part of one, with the names of a file's columns without that of the file before them.
+
+    Of columns by name, such as `{l_foot: "left.csv::f{axis}", r_foot: "right.csv::f{axis}"}`, those of the file alone,
+    if it has any; `others`: the names of all files.
+    """
+    if isinstance(value, str):
+        return value.removeprefix(f"{file}{OF_FILE}")
+    if isinstance(value, list):
+        return [as_in_file(one, file, others) for one in value]
+    if isinstance(value, dict):
+        own = {key: as_in_file(one, file, others) for key, one in value.items()}
+        elsewhere = tuple(f"{other}{OF_FILE}" for other in others if other != file)
+        kept = {key: one for key, one in own.items() if not (isinstance(one, str) and one.startswith(elsewhere))}
+        return kept or own
+    is_entry = dataclasses.is_dataclass(value) and not isinstance(value, type)
+    return (
+        dataclasses.replace(value, **{key: as_in_file(one, file, others) for key, one in vars(value).items()})
+        if is_entry
+        else value
+    )

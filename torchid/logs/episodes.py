@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, excerpt
-from torchid.logs.column_entries import KEY, Episodes
-from torchid.logs.column_map import PLACEHOLDER, Columns
+from torchid.logs.columns import KEY, PLACEHOLDER, Columns, Episodes
 from torchid.logs.containers import Container
 
 
@@ -35,7 +34,17 @@ class Arrays:
 
     def stamps(self, time: NDArray[Any], rows: int, has_step: bool) -> NDArray[Any]:
         """Stamps of all samples, of those that were read; `has_step`: or counted, of so many rows throughout."""
-        return time
+        counts = self._counts_of(rows)
+        if has_step and len(counts) > 1:
+            return np.concatenate([time[:count] for count in counts])
+        first = np.cumsum([0, *counts])
+        if len(time) != first[-1] or not (time[first[1:-1]] > time[first[1:-1] - 1]).any():
+            return time
+        return np.asarray(time - np.repeat(time[first[:-1]], counts))  # of a clock that goes on to the next episode
+
+    def _counts_of(self, rows: int) -> Sequence[int]:
+        """Samples of each episode in so many rows."""
+        return [rows]
 
 
 def flat(array: NDArray[Any], shape: tuple[int, int], axis: int, lengths: NDArray[Any] | None = None) -> NDArray[Any]:
@@ -55,30 +64,6 @@ def flat(array: NDArray[Any], shape: tuple[int, int], axis: int, lengths: NDArra
     return by_episode.reshape(-1, *array.shape[2:])
 
 
-def filled_lengths(array: NDArray[Any], axis: int) -> NDArray[np.int64]:
-    """Samples of each episode (E,) of an array of numbers (E, N, ...), or (N, E, ...), that is filled up behind them.
-
-    What fills it is 0 or NaN throughout, or repeats the last sample.
-
-    Args:
-        array: of a file.
-        axis: that counts episodes, 0 or 1.
-    """
-    rows = np.moveaxis(array, axis, 0)
-    rows = np.nan_to_num(rows.reshape(*rows.shape[:2], -1).astype(float))
-    differs = (rows != rows[:, -1:]).any(axis=2)
-    own = np.where(differs.any(axis=1), rows.shape[1] - differs[:, ::-1].argmax(axis=1), 0)
-    return own + rows[:, -1].any(axis=1).astype(np.int64)
-
-
-def _begun_anew(time: NDArray[Any], counts: Sequence[int] | NDArray[np.int64]) -> NDArray[Any]:
-    """Stamps of episodes of so many samples that each begin at 0, where a clock goes on from one to the next."""
-    first = np.cumsum([0, *counts])
-    if len(time) != first[-1] or not (time[first[1:-1]] > time[first[1:-1] - 1]).any():
-        return time
-    return np.asarray(time - np.repeat(time[first[:-1]], counts))
-
-
 class StackedArrays(Arrays):
     """Arrays that have an axis of episodes beside that of samples, as the positions of the joints have."""
 
@@ -92,39 +77,30 @@ class StackedArrays(Arrays):
             found = f"axis: {entry.axis}, but '{excerpt(name)}' has shape {array.shape}"
             raise LogError.at_field(f"{KEY}.episodes", found, "arrays (episodes, samples, ...) or the other way round")
         self._shape = (int(array.shape[0]), int(array.shape[1]))
-        count, samples = self._shape[:: -1 if self._axis else 1]
-        self._lengths = None if entry.lengths is None else self._read_lengths(entry.lengths)
-        if self._lengths is not None and (
-            self._lengths.shape != (count,) or not ((self._lengths > 0) & (self._lengths <= samples)).all()
-        ):
-            accepted = f"{count} numbers of samples, from 1 to {samples}"
-            raise LogError.at_field(f"{KEY}.episodes.lengths", f"'{entry.lengths}' has others", accepted)
-        self._counts = np.full(count, samples) if self._lengths is None else self._lengths
-
-    def _read_lengths(self, name: str) -> NDArray[np.int64]:
-        """Samples of each episode: an array of numbers of them, or one that is filled up; LogError for others."""
-        array = super().load(name) if name in self.names else np.empty(0)
-        if array.dtype.kind == "f" and array.shape[:2] == self._shape:
-            return filled_lengths(array, self._axis)
-        if array.dtype.kind not in "iu":
-            accepted = f"an array of whole numbers, one for each, or one {self._shape} that is filled up behind these"
-            raise LogError.at_field(f"{KEY}.episodes.lengths", f"'{excerpt(name)}'", accepted)
-        return array.ravel().astype(np.int64)
+        count, self._samples = self._shape[:: -1 if self._axis else 1]
+        lengths = np.full(count, self._samples)
+        if entry.lengths is not None:
+            given = container.load(entry.lengths) if entry.lengths in self.names else np.empty(0)
+            lengths = given.ravel()
+            if (
+                given.dtype.kind not in "iu"
+                or lengths.shape != (count,)
+                or ((lengths < 1) | (lengths > self._samples)).any()
+            ):
+                accepted = f"an array of {count} whole numbers, the samples of each, from 1 to {self._samples}"
+                raise LogError.at_field(f"{KEY}.episodes.lengths", f"'{excerpt(entry.lengths)}'", accepted)
+        self._lengths = lengths.astype(np.int64)
 
     def load(self, name: str) -> NDArray[Any]:
         """One of them, with a row for each sample."""
         array = super().load(name)
-        samples = self._shape[1 - self._axis]
-        if array.size == samples != len(self._counts) and array.ndim < 3 and array.dtype.kind in "fiu":
-            return self._of_all(array.ravel())  # stamps of one clock
+        if array.size == self._samples != len(self._lengths) and array.ndim < 3 and array.dtype.kind in "fiu":
+            clock = array.ravel()  # one for all
+            return np.concatenate([clock[:count] for count in self._lengths])
         return flat(array, self._shape, self._axis, self._lengths)
 
-    def _of_all(self, clock: NDArray[Any]) -> NDArray[Any]:
-        return np.concatenate([clock[:count] for count in self._counts])
-
-    def stamps(self, time: NDArray[Any], rows: int, has_step: bool) -> NDArray[Any]:
-        """Those that begin anew with each episode."""
-        return self._of_all(time) if has_step else _begun_anew(time, self._counts)
+    def _counts_of(self, rows: int) -> Sequence[int]:
+        return self._lengths.tolist()
 
 
 def in_groups(pattern: str) -> re.Pattern[str]:
@@ -148,21 +124,20 @@ class GroupedArrays(Arrays):
     def __init__(self, container: Container, entry: Episodes) -> None:
         """Look for the groups; LogError where there are none."""
         super().__init__(container)
-        self._parts: Mapping[str, list[str]] = groups_of(self.names, entry.groups or "")
+        pattern = entry.groups or ""
+        self._parts = groups_of(self.names, pattern)
         if not self._parts:
             accepted = f"a name with * for the number, of groups that hold the same arrays: {excerpt(self.names[0])}"
-            raise LogError.at_field(
-                f"{KEY}.episodes.groups", f"'{excerpt(entry.groups or '')}', no such groups", accepted
-            )
-        own = in_groups(entry.groups or "")
-        self.names = [*self._parts, *(x for x in self.names if not own.fullmatch(x) and x not in self._parts)]
+            raise LogError.at_field(f"{KEY}.episodes.groups", f"'{excerpt(pattern)}', no such groups", accepted)
+        regex = in_groups(pattern)
+        self.names = [*self._parts, *(x for x in self.names if not regex.fullmatch(x) and x not in self._parts)]
         self._counts = dict[int, list[int]]()  # samples of each, by those of all
 
     def load(self, name: str) -> NDArray[Any]:
         """One of them, that of all groups, or of the first where each has a single value; LogError for other shapes."""
         if name not in self._parts:
             return super().load(name)
-        parts = [super(GroupedArrays, self).load(part) for part in self._parts[name]]
+        parts = [self._container.load(part) for part in self._parts[name]]
         if not any(part.ndim for part in parts):
             return parts[0]
         for part, text in zip(parts, self._parts[name], strict=True):
@@ -174,12 +149,8 @@ class GroupedArrays(Arrays):
             self._counts[sum(map(len, parts))] = [len(part) for part in parts]
         return np.concatenate(parts)
 
-    def stamps(self, time: NDArray[Any], rows: int, has_step: bool) -> NDArray[Any]:
-        """Those that begin anew with each episode."""
-        if rows not in self._counts:
-            return time
-        counts = self._counts[rows]
-        return np.concatenate([time[:count] for count in counts]) if has_step else _begun_anew(time, counts)
+    def _counts_of(self, rows: int) -> Sequence[int]:
+        return self._counts.get(rows, [rows])
 
 
 def _positions(columns: Columns, names: Collection[str]) -> str:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from torchid.logs.column_entries import Plate
-from torchid.logs.log import FLAGS, POINTS, SHAPES, WRENCHES, FloatArray, check_finite, check_shape, to_float64
+from torchid.logs.log import FLAGS, POINTS, SHAPES, WRENCHES, check_finite, check_shape, to_float64
 
 _FIELD = WRENCHES[1]
 
@@ -52,30 +48,3 @@ def about_world_origin(raw: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         idle = idle | (raw[FLAGS] == 0)
     moved[(idle & unknown)[..., None] & np.isnan(moved)] = 0.0
     return raw | {_FIELD: np.concatenate([force, moved], axis=2), POINTS: np.zeros_like(points)}
-
-
-@dataclass(frozen=True)
-class PlatePoses:
-    """Poses of the plates that contacts stand on.
-
-    `rotation`: (C, 3, 3), from a plate's axes to the world's; `origin`: (C, 3) [m], in the world.
-    """
-
-    rotation: FloatArray
-    origin: FloatArray
-
-    @classmethod
-    def of(cls, plates: Sequence[Plate]) -> PlatePoses:
-        """Those of settings, one for each contact."""
-        rpy = np.array([plate.rpy_deg for plate in plates]).reshape(-1, 3)
-        origin = np.array([plate.position for plate in plates]).reshape(-1, 3)
-        return cls(Rotation.from_euler("xyz", rpy, degrees=True).as_matrix(), origin)
-
-    def wrenches(self, wrench: FloatArray) -> FloatArray:
-        """Wrenches (N, C, 6) along the plates' axes, along those of the world."""
-        vectors = wrench.reshape(*wrench.shape[:2], 2, 3)
-        return np.asarray(np.einsum("cij,nckj->ncki", self.rotation, vectors).reshape(wrench.shape))
-
-    def points(self, points: FloatArray) -> FloatArray:
-        """Points (N, C, 3) [m] on plates, in the world."""
-        return np.asarray(np.einsum("cij,ncj->nci", self.rotation, points) + self.origin)

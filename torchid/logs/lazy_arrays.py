@@ -21,7 +21,7 @@ from torchid.errors import InputError, LogError
 from torchid.guards import check_fields
 
 if TYPE_CHECKING:
-    from torchid.logs.mapped_fields import MappedFields
+    from torchid.logs.schema import FileFields
 
 
 class LazyArray(Protocol):
@@ -126,7 +126,7 @@ class Computed:
 class MappedArray:
     """A field whose arrays are read where it is sliced."""
 
-    def __init__(self, fields: MappedFields, name: str, arrays: Mapping[str, LazyArray]) -> None:
+    def __init__(self, fields: FileFields, name: str, arrays: Mapping[str, LazyArray]) -> None:
         """The field of a name, of open arrays. Raises LogError: arrays that do not fit it."""
         self._fields, self._name, self._arrays = fields, name, arrays
         self._constant = fields.constant_sources(name)

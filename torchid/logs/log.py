@@ -68,6 +68,7 @@ NORMALS = "contact_normal_world"
 POINTS = "contact_wrench_point_world"  # of a file alone, see `about_world_origin`
 FLAGS = "contact_active"
 FORCE_NORMAL = "contact_force_normal"
+TEXT_FIELD = "imu_frame"  # the one field that is text, the same in every row of a table
 
 #: Readings of sensors at contacts: 0, whatever was recorded, where nothing touches.
 CONTACT_READINGS = (*WRENCHES, FORCE_NORMAL)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from torchid.errors import LogError
 from torchid.logs.log import NORM_TOLERANCE, FloatArray
@@ -57,6 +56,8 @@ def quaternion_of_rpy(rpy: FloatArray, order: str) -> FloatArray:
     """
     known = np.isfinite(rpy).all(axis=1)
     quat = np.full((len(rpy), 4), np.nan)
+    from scipy.spatial.transform import Rotation
+
     quat[known] = Rotation.from_euler("xyz", rpy[known]).as_quat()
     return quat if order == "xyzw" else np.roll(quat, 1, axis=1)
 

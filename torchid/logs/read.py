@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, about_file, current_file, during, warn_about_file
+from torchid.errors import LogError, about_file, current_file, during
 from torchid.logs.alignment import align_by_stamps, read_joined
 from torchid.logs.arrays import load_part, parse_frame, parse_names, require_plain
-from torchid.logs.column_map import Columns
+from torchid.logs.bags import read_bag
+from torchid.logs.columns import Columns
 from torchid.logs.containers import (
     LogKind,
     existing_log_kind,
@@ -42,7 +43,6 @@ from torchid.logs.log import (
     VARIANTS,
     FloatArray,
     Log,
-    UnknownFieldError,
     check_finite,
     check_shape,
     column_labels,
@@ -54,11 +54,9 @@ from torchid.logs.log import (
     parse_time,
     to_float64,
 )
-from torchid.logs.mapped_fields import map_arrays, read_stamps
-from torchid.logs.name_matching import is_foreign, unknown_columns
 from torchid.logs.quaternion import make_sign_continuous, rotate_to_base, rotate_to_world
-from torchid.logs.ros_read import read_bag
 from torchid.logs.ros_topics import Topics
+from torchid.logs.schema import match_arrays, read_stamps
 from torchid.logs.tables import read_table, save_table
 from torchid.logs.time_range import Recording, TimeRange, recording_starts, split_range
 
@@ -215,8 +213,7 @@ def _stamps(raw: dict[str, NDArray[Any]]) -> FloatArray:
 
 
 def check_fields_given(names: Collection[str], needs_flags: bool = True) -> None:
-    """Raise LogError for unknown or missing fields, and for invalid combinations; `needs_flags` as in `read_log`."""
-    _check_known(names)
+    """Raise LogError for missing fields, and for invalid combinations; `needs_flags` as in `read_log`."""
     for name in REQUIRED:
         if name not in names:
             raise LogError.at_field(name, "missing", f"a log with {', '.join(REQUIRED)}")
@@ -225,15 +222,13 @@ def check_fields_given(names: Collection[str], needs_flags: bool = True) -> None
 
 def _read_one(bridge_gaps_s: float | None, path: Path, columns: Columns | None) -> dict[str, NDArray[Any]]:
     """The fields of one of several files of a log, whose gaps no spline to the stamps of others can cross."""
-    if existing_log_kind(path) is LogKind.TABLE:
-        raw = read_table(path, columns)
-    else:
-        raw = _read_arrays(path, columns, _check_known)
+    is_table = existing_log_kind(path) is LogKind.TABLE
+    raw = read_table(path, columns) if is_table else _read_arrays(path, columns, None)
     return bridge_gaps(about_world_origin(raw), bridge_gaps_s) if "time" in raw else raw
 
 
 def _read_arrays(
-    path: Path, columns: Columns | None, check: Callable[[Collection[str]], None]
+    path: Path, columns: Columns | None, check: Callable[[Collection[str]], None] | None
 ) -> dict[str, NDArray[Any]]:
     """The arrays of a .npz or HDF5 file; all names are checked first."""
     with open_container(path) as container:
@@ -247,36 +242,18 @@ def _read_arrays(
             return load_part(name, names, load)
 
         names = arrays.names
-        mapped = None if columns is None else map_arrays(columns, names, load)
-        check(names if mapped is None else mapped.given)
-        if mapped is None:
-            return {name: load(name) for name in names}
+        mapped = match_arrays(columns, names, load)
+        if check is not None:
+            check(mapped.given)
         raw = mapped.read(take)
+        if columns is None:
+            return raw
         if "time" in raw:
-            raw["time"] = arrays.stamps(raw["time"], len(raw.get("joint_position", ())), mapped.step is not None)
+            rows = next(iter(raw["joint_position"].shape if "joint_position" in raw else ()), 0)
+            raw["time"] = arrays.stamps(raw["time"], rows, mapped.step is not None)
         if others := {name: read_stamps(entry, load) for name, entry in mapped.other_times(names).items()}:
             return align_by_stamps(raw, {name: mapped.sources_of(name) for name in mapped.fields}, others)
-        return _as_many_as_controls(raw)
-
-
-def _as_many_as_controls(raw: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Mapped fields without the last state, of which optimal control has one more than torques."""
-    count = len(raw.get("joint_torque", ()))
-    sampled = {name: x for name, x in raw.items() if field_shape(name)[:1] == ("N",) and name != "joint_torque"}
-    if not count or any(len(x) != count + 1 for x in sampled.values()):
         return raw
-    warn_about_file("joint_torque has one sample less than all else, as controls have: the last state is left out")
-    return raw | {name: x[:-1] for name, x in sampled.items()}
-
-
-def _check_known(names: Collection[str]) -> None:
-    """Raise LogError on unknown fields."""
-    known = (*SHAPES, *VARIANTS)
-    unknown = [name for name in names if name not in known]
-    if len(unknown) == 1 and not is_foreign(unknown[0]):
-        raise UnknownFieldError.at_field("field", unknown[0], known)
-    if unknown:
-        raise unknown_columns(unknown)
 
 
 def _check_combination(names: Collection[str], needs_flags: bool) -> None:

@@ -1,40 +1,42 @@
-"""Files of tables, CSV, Parquet and JSON lines: names and rows of their columns (the only module with pyarrow)."""
+"""Files of tables, in the process that reads them: CSV, Parquet and JSON lines as named columns (with pyarrow)."""
 
 from __future__ import annotations
 
+import csv
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, excerpt, how_to_install
-from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_unpacked_size
-from torchid.logs.columns import TEXT_COLUMN, check_header, is_number, is_stamp
-from torchid.logs.containers import JSON_LINES, TEXT_TABLES
-from torchid.logs.json_files import JsonColumns, read_json_lines
-from torchid.logs.table_headers import BLOCK, NestedColumns, TextHeader, read_header
-from torchid.reader import RemoteObject, open_apart
+from torchid.errors import LogError, excerpt, how_to_install, is_plain
+from torchid.guards import MAX_ARRAYS, MAX_COLUMNS, MAX_LETTERS, MAX_LIST, MAX_SCHEMA, check_names, check_unpacked_size
+from torchid.logs.containers import JSON_LINES, OPENSIM, TEXT_TABLES
+from torchid.logs.log import TEXT_FIELD
 
-#: Rows that are converted at a time; lines of JSON.
-_ROWS, _LINES = 2**16, 2**12
-#: Rows from which a map is proposed.
-_SAMPLE = 2**12
-#: Limits on the metadata of a Parquet file (bytes of names and statistics, entries of lists); checksums are verified.
-_PARQUET = {
+_BLOCK_BYTES = 2**22  # of text that is parsed at a time; no row may be longer
+_BATCH_ROWS, _SAMPLE_ROWS = 2**16, 2**12
+_HEADER_LINES, _OPENSIM_LINES = 64, 1000  # before the first row
+_MAX_COLUMN_LETTERS = 2 * MAX_LETTERS  # the name of a column contains that of a joint
+_PARQUET = {  # limits on metadata: bytes of names and statistics, entries of lists
     "thrift_string_size_limit": 2**26,
     "thrift_container_size_limit": MAX_SCHEMA,
     "page_checksum_verification": True,
 }
-_BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
-_SHORT_ROW = re.compile(r".*?Row #(\d+): Expected (\d+) columns, got (\d+)", re.DOTALL)
-_QUOTES = "'\n"
+_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _EMPTY = ["", " ", "  ", "nan", "NaN", "NAN"]
 _NUMBERS = "numbers, or empty cells where nothing was measured"
+_BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
+_SHORT_ROW = re.compile(r".*?Row #(\d+): Expected (\d+) columns, got (\d+)", re.DOTALL)
+_SEPARATORS = (",", ";", "\t")
+_COMMENT = re.compile(r"^(#|%|//)\s*")
+_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)|true|false", re.IGNORECASE)
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d.*")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 
 
 def import_pyarrow(path: Path) -> Any:
@@ -47,372 +49,429 @@ def import_pyarrow(path: Path) -> Any:
     return pyarrow
 
 
-class TableFile:
-    """A table that another process reads."""
-
-    def __init__(self, pa: Any, opened: RemoteObject) -> None:
-        self._pa, self._opened = pa, opened
-
-    def column_names(self) -> tuple[list[str], bool]:
-        """The columns, and whether angles are in degrees by what the file says."""
-        names, in_degrees = self._opened.call("column_names")
-        return names, in_degrees
-
-    def read_rows(self, sources: Collection[str], texts: Collection[str], only: bool, whole: bool) -> Iterator[Any]:
-        """Batches of rows of some columns, see `_read_rows`."""
-        for packed in self._opened.stream("read_rows", list(sources), list(texts), only, whole):
-            yield from self._unpacked(packed).to_batches()
-
-    def sample_rows(self) -> tuple[list[str], Any]:
-        """The columns, and the first rows; LogError where there are none."""
-        names, packed = self._opened.call("sample_rows")
-        return names, self._unpacked(packed).combine_chunks().to_batches()[0]
-
-    def whole_table(self) -> Any:
-        """All columns and rows as they are, with columns that are in others apart."""
-        return self._unpacked(self._opened.call("whole_table"))
-
-    def count_bytes(self) -> int:
-        """Bytes of the numbers, without reading them."""
-        return int(self._opened.call("count_bytes"))
-
-    def _unpacked(self, packed: bytes) -> Any:
-        return self._pa.ipc.open_stream(packed).read_all()
-
-
-@contextmanager
-def open_table(pa: Any, path: Path) -> Iterator[TableFile]:
-    """Open a table in another process."""
-    with open_apart(_serve_table, path) as opened:
-        yield TableFile(pa, opened)
-
-
-@contextmanager
-def _serve_table(path: Path) -> Iterator[_Served]:
-    yield _Served(path)
-
-
-class _Served:
-    """A table in the process that reads it; rows are streams of Arrow's format."""
-
-    def __init__(self, path: Path) -> None:
-        self._pa, self._path = import_pyarrow(path), path
-
-    def column_names(self) -> tuple[list[str], bool]:
-        return _column_names(self._pa, self._path)
-
-    def read_rows(self, *args: Any) -> Iterator[bytes]:
-        return map(self._packed, _read_rows(self._pa, self._path, *args))
-
-    def sample_rows(self) -> tuple[list[str], bytes]:
-        names, batch = _sample_rows(self._pa, self._path)
-        return names, self._packed(batch)
-
-    def whole_table(self) -> bytes:
-        return self._packed(_whole_table(self._pa, self._path))
-
-    def count_bytes(self) -> int:
-        return _count_bytes(self._pa, self._path)
-
-    def _packed(self, rows: Any) -> bytes:
-        sink = self._pa.BufferOutputStream()
-        with self._pa.ipc.new_stream(sink, rows.schema) as writer:
-            writer.write(rows)
-        packed: bytes = sink.getvalue().to_pybytes()
-        return packed
-
-
 def is_text_table(path: Path) -> bool:
     """Whether a table is of text with a line of names."""
     return path.suffix.lower() in TEXT_TABLES
 
 
-def _is_json(path: Path) -> bool:
-    return path.suffix.lower() in JSON_LINES
+# --------------------------------------------------------------------------------------------------- lines before rows
 
 
-def _column_names(pa: Any, path: Path) -> tuple[list[str], bool]:
-    """The columns of a table, and whether its angles are in degrees by what it says."""
-    if is_text_table(path):
-        header = read_header(path)
-        return header.named, header.in_degrees
-    if _is_json(path):
-        return list(_first_lines(path)), False
-    import pyarrow.parquet
+@dataclass(frozen=True)
+class TextHeader:
+    """The lines of a table of text before its rows.
 
-    with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-        return NestedColumns(pa, file).names, False
+    Attributes:
+        names: of the columns.
+        lines: how many there are before the first row.
+        separator: between cells.
+        decimal_mark: . or ,
+        encoding: of its letters, UTF-8 or else Latin-1.
+        in_degrees: whether it says that angles are in degrees.
+        is_open: whether rows end with a separator, so that there is one more, empty column.
+        has_rows: whether there are any.
+    """
+
+    names: list[str]
+    lines: int
+    separator: str
+    decimal_mark: str
+    encoding: str
+    in_degrees: bool
+    is_open: bool
+    has_rows: bool
 
 
-def _read_rows(
-    pa: Any, path: Path, sources: Collection[str], texts: Collection[str], only: bool, whole: bool
-) -> Iterator[Any]:
-    """Batches of rows of some columns of a table.
+def read_header(path: Path) -> TextHeader:
+    """The names of the columns of a table of text.
 
-    Args:
-        pa: pyarrow.
-        path: the file.
-        sources: columns of numbers or stamps, and of texts and flags.
-        texts: those of them that may be texts or flags.
-        only: whether the file has other columns too.
-        whole: whether all rows are kept, which limits their number.
+    They are in the one line above the first row of numbers that has as many cells; all other lines there are remarks.
+    A column without a name is called `unnamed_0` by its place; without a line of names all are called `column_0`, ...
+    In OpenSim's tables all that is below the line `endheader`.
 
     Raises:
-        LogError: a cell that is no number, or a file that is too large.
+        LogError: no names, or lines between these and the rows, such as units.
     """
-    read = _read_csv if is_text_table(path) else _read_json if _is_json(path) else _read_parquet
-    return read(pa, path, sources, texts, only, whole)
+    with path.open("rb") as stream:
+        above, in_degrees = _opensim_lines(path, stream) if path.suffix.lower() in OPENSIM else (0, False)
+        lines = [line for _ in range(_HEADER_LINES) if (line := stream.readline(_BLOCK_BYTES))]
+    if any(len(line) == _BLOCK_BYTES for line in lines[:1]):
+        raise LogError(path, "header", f"a line of at least {_BLOCK_BYTES} bytes", "the names of the columns")
+    encoding, texts = _decoded(path, lines)
+    first = next((number for number, text in enumerate(texts) if _is_row(text)), len(texts))
+    named = _line_of_names(path, texts, first)
+    if named is not None:
+        first = next((k for k in range(named + 1, first) if not _COMMENT.match(texts[k])), min(first, len(texts)))
+    row = texts[first] if first < len(texts) else ""
+    title = "" if named is None else _COMMENT.sub("", texts[named])
+    separator = _separator(row or title)
+    cells, names = _cells(row, separator), [cell.strip() for cell in _cells(title, separator)]
+    if named is None:
+        counts = len(cells) > 1 and [cell.strip() for cell in cells] == [str(k) for k in range(len(cells))]
+        first += counts  # as pandas counts the columns
+        names = [f"column_{k}" for k in range(len(cells) - (len(cells) > 1 and not cells[-1].strip()))]
+    if len(cells) == len(names) - 1 and not names[-1]:
+        names.pop()
+    is_open = len(cells) == len(names) + 1 and not cells[-1].strip()
+    if not is_open and len(names) > 1 and cells and len(cells) == len(names) and not names[-1] + cells[-1].strip():
+        names.pop()
+        is_open = True
+    comma = separator != "," and any(
+        _DECIMAL_COMMA.fullmatch(cell.strip()) for text in texts[first:] for cell in _cells(text, separator)
+    )
+    names = [name or f"unnamed_{number}" for number, name in enumerate(names)]
+    check_column_names(names)
+    has_rows = first < len(texts) and any(text.strip() for text in texts[first:])
+    return TextHeader(names, above + first, separator, "," if comma else ".", encoding, in_degrees, is_open, has_rows)
 
 
-def _sample_rows(pa: Any, path: Path) -> tuple[list[str], Any]:
-    """The columns of a table, and its first rows; LogError where it has none."""
-    read = _sample_csv if is_text_table(path) else _sample_json if _is_json(path) else _sample_parquet
-    names, batch = read(pa, path)
-    if batch is None or not batch.num_rows:
-        raise LogError.at_field("time", "no samples", "at least one sample")
-    return names, batch
+def _decoded(path: Path, lines: Sequence[bytes]) -> tuple[str, list[str]]:
+    """The encoding, UTF-8 or else Latin-1, as of degree signs in old spreadsheets; and the lines."""
+    whole = b"".join(lines)
+    if b"\0" in whole:
+        raise LogError(path, "header", "bytes that are no letters", "text in UTF-8 or Latin-1")
+    if not whole.strip():
+        raise LogError(path, "header", "an empty line", "the names of the columns")
+    try:
+        whole.decode()
+        encoding = "utf-8"
+    except UnicodeDecodeError:
+        encoding = "latin-1"
+    return encoding, [line.decode(encoding).removeprefix("\ufeff").rstrip("\r\n") for line in lines]
 
 
-def _whole_table(pa: Any, path: Path) -> Any:
-    """All columns and rows of a table as they are, with columns that are in others apart."""
-    if _is_json(path):
-        blocks = list(read_json_lines(path, _LINES, partial(check_size, path, whole=True)))
-        names = dict.fromkeys(name for block in blocks for name in block)
-        return pa.Table.from_batches([_json_batch(pa, block, names) for block in blocks])
-    if is_text_table(path):
+def _line_of_names(path: Path, texts: Sequence[str], first: int) -> int | None:
+    """The number of the line with names above the first row, None where that is the first of all."""
+    plain = [k for k in range(first) if texts[k].strip() and not _COMMENT.match(texts[k])]
+    if first == len(texts):  # rows of words, or none
+        return plain[0] if plain else 0
+    separator = _separator(texts[first])
+    count = len(_cells(texts[first].rstrip(separator), separator))
+    alike = [k for k in range(first) if len(_cells(_COMMENT.sub("", texts[k]).rstrip(separator), separator)) == count]
+    named = next((k for k in alike if k in plain), (alike or plain)[-1] if alike or plain else None)
+    if between := [k for k in plain if named is not None and k > named and not _count_numbers(texts[k])]:
+        found = f"'{excerpt(texts[between[0]])}' between the names and the first row"
+        accepted = "rows of numbers below the names; units go to logs.columns, and names in several lines into one"
+        raise LogError(path, f"line {between[0] + 1}", found, accepted)
+    return named
+
+
+def _is_row(text: str) -> bool:
+    """Whether most of the cells of a line are numbers, or the first one is a date."""
+    cells = [cell.strip() for cell in _cells(text, _separator(text)) if cell.strip()]
+    numbers = _count_numbers(text)
+    is_dated = numbers > 0 and _DATE.fullmatch(cells[0]) is not None
+    return not _COMMENT.match(text) and (2 * numbers > len(cells) or is_dated)
+
+
+def _count_numbers(text: str) -> int:
+    return sum(_NUMBER.fullmatch(cell.strip()) is not None for cell in _cells(text, _separator(text)))
+
+
+def _separator(text: str) -> str:
+    """The mark between which most cells are numbers, of several that with most cells; a space if none separates any.
+
+    Of `0;1,5;2,5` it is the semicolon, though there are as many commas.
+    """
+    counts = {}
+    for mark in _SEPARATORS:
+        cells = _cells(text, mark)
+        numbers = sum(map(bool, map(_NUMBER.fullmatch, cells)))
+        counts[mark] = (numbers == len(cells), numbers, len(cells))
+    mark = max(counts, key=lambda mark: counts[mark])
+    return mark if counts[mark][-1] > 1 or " " not in text.strip() else " "
+
+
+def _cells(text: str, mark: str) -> list[str]:
+    try:
+        return next(csv.reader([text], strict=True, delimiter=mark), [])
+    except csv.Error:  # behind a quoted name stands another mark
+        return [text]
+
+
+def _opensim_lines(path: Path, stream: Any) -> tuple[int, bool]:
+    """Read up to the line `endheader`: how many lines there are, and whether angles are in degrees."""
+    in_degrees = False
+    for number in range(1, _OPENSIM_LINES):
+        line = stream.readline(_BLOCK_BYTES)
+        key, _, value = line.decode("utf-8-sig").strip().partition("=")
+        if key.strip().lower() == "indegrees":
+            in_degrees = value.strip().lower() != "no"
+        if key.strip().lower() == "endheader":
+            return number, in_degrees
+        if not line:
+            break
+    raise LogError(
+        path, "header", "no line endheader", "OpenSim's lines up to endheader, then the names of the columns"
+    )
+
+
+def check_column_names(names: Sequence[str]) -> None:
+    """Raise LogError for too many columns, and names that are too long, of control characters, or given twice."""
+    if len(names) > MAX_COLUMNS:
+        raise LogError.at_field("file", f"{len(names)} columns", f"at most {MAX_COLUMNS}")
+    seen = set[str]()
+    for name in names:
+        if len(name) > _MAX_COLUMN_LETTERS or not is_plain(name):
+            found = f"a name of {len(name)} characters: {excerpt(name)}"
+            raise LogError.at_field("header", found, f"names of one line and at most {_MAX_COLUMN_LETTERS} characters")
+        if name in seen:
+            raise LogError.at_field(f"column '{name}'", "given twice", "every column once")
+        seen.add(name)
+
+
+# ---------------------------------------------------------------------------------------- in the process that reads it
+
+
+class _Served:
+    """A table in the process that reads it. Nested columns are columns: `state.q` of structures, `q[0]` of lists."""
+
+    def __init__(self, path: Path) -> None:
+        self._pa, self._path, self._columns = import_pyarrow(path), path, 0
+        self._header = read_header(path) if is_text_table(path) else None
+        self._lengths = dict[str, int]()  # numbers in each row of columns of lists
+        self._origin = dict[str, str]()  # of a column of numbers, the column of lists
+        self._first = self._flat(self._read_first())
+        check_column_names(self._names())
+
+    def _names(self) -> list[str]:
+        return list(self._first.column_names)
+
+    def header(self) -> tuple[list[str], bool]:
+        """The columns, and whether the file says that angles are in degrees."""
+        return self._names(), self._header is not None and self._header.in_degrees
+
+    def sample(self) -> dict[str, NDArray[Any] | None]:
+        """The columns with some of their first rows, None for what is neither numbers nor texts."""
+        if not self._first.num_rows:
+            raise LogError.at_field("time", "no samples", "at least one sample")
+        self._check_size(self._first.num_rows, whole=False)
+        return {name: self._values(name, self._first[name]) for name in self._names()}
+
+    def count_bytes(self) -> int:
+        """Bytes of the numbers, without reading them."""
+        if self._path.suffix.lower() == ".parquet":
+            import pyarrow.parquet
+
+            with pyarrow.parquet.ParquetFile(self._path, **_PARQUET) as file:
+                return 8 * int(file.metadata.num_rows) * len(self._names())
+        with self._path.open("rb") as stream:
+            lines = sum(piece.count(b"\n") for piece in iter(lambda: stream.read(_BLOCK_BYTES), b""))
+        return 8 * len(self._names()) * lines
+
+    def read_rows(self, sources: Sequence[str], texts: Sequence[str], whole: bool) -> Iterator[dict[str, NDArray[Any]]]:
+        """Some rows of some columns at a time.
+
+        Args:
+            sources: the columns.
+            texts: those that may hold texts.
+            whole: whether all rows are kept, which limits their number.
+
+        Raises:
+            LogError: a cell that is no number, or a file that is too large.
+        """
+        self._columns, rows = len(sources), 0
+        for table in self._tables(sources, texts):
+            rows += table.num_rows
+            self._check_size(rows, whole)
+            flat = self._flat(table)
+            block = {name: self._values(name, flat[name]) for name in sources}
+            for name, values in block.items():
+                if values is None or (values.dtype.kind == "U" and name not in texts):
+                    accepted = "text" if name == TEXT_FIELD else "real numbers"
+                    raise LogError(self._path, f"column '{name}'", f"values of type {flat[name].type}", accepted)
+                if name == TEXT_FIELD and values.dtype.kind != "U":
+                    raise LogError(self._path, f"column '{name}'", f"values of type {flat[name].type}", "text")
+            if flat.num_rows:
+                yield {name: values for name, values in block.items() if values is not None}
+
+    def _check_size(self, rows: int, whole: bool) -> None:
+        """Raise LogError for more numbers than are read whole, or than a file of that size has."""
+        size = 8 * rows * self._columns
+        if whole and size > MAX_ARRAYS:
+            raise LogError(self._path, "file", f"{rows} rows of {self._columns} columns", f"at most {MAX_ARRAYS} bytes")
+        check_unpacked_size(self._path, size)
+
+    # ------------------------------------------------------------------------------------------- rows as Arrow's tables
+
+    def _read_first(self) -> Any:
+        """The first rows, with the types that Arrow infers."""
+        if self._header is not None:
+            columns = self._header.names
+            if not self._header.has_rows:
+                return self._pa.table({name: self._pa.nulls(0) for name in columns})
+            return self._pa.Table.from_batches([next(iter(self._csv_batches(self._header, {}, columns)))])
+        if self._path.suffix.lower() in JSON_LINES:
+            return self._json_table().slice(0, _SAMPLE_ROWS)
+        with self._parquet() as file:
+            check_column_names([field.name for field in file.schema_arrow])
+            self._columns = file.metadata.num_columns
+            self._check_size(file.metadata.num_rows, whole=False)
+            batch = next(file.iter_batches(_SAMPLE_ROWS), None)
+            return file.schema_arrow.empty_table() if batch is None else self._pa.Table.from_batches([batch])
+
+    def _tables(self, sources: Sequence[str], texts: Sequence[str]) -> Iterator[Any]:
+        if self._header is not None:
+            if self._header.has_rows:
+                types = {name: self._csv_type(name, name in texts) for name in sources}
+                yield from (
+                    self._pa.Table.from_batches([batch]) for batch in self._csv_batches(self._header, types, sources)
+                )
+        elif self._path.suffix.lower() in JSON_LINES:
+            yield self._json_table()
+        else:
+            with self._parquet() as file:
+                of_file = list(dict.fromkeys(self._origin.get(name, name) for name in sources))
+                for batch in file.iter_batches(_BATCH_ROWS, columns=of_file):
+                    yield self._pa.Table.from_batches([batch])
+
+    def _csv_type(self, name: str, is_text: bool) -> Any:
+        """That of a column: the inferred one of dates, truth values and allowed texts, else numbers."""
+        types, inferred = self._pa.types, self._first.schema.field(name).type
+        is_kept = types.is_temporal(inferred) or types.is_boolean(inferred) or (is_text and types.is_string(inferred))
+        if is_text and name == TEXT_FIELD:
+            return self._pa.string()
+        return inferred if is_kept else self._pa.float64()
+
+    def _csv_batches(self, header: TextHeader, types: Mapping[str, Any], sources: Sequence[str]) -> Iterator[Any]:
         import pyarrow.csv
 
-        header = read_header(path)
-        check_header(header.texts)
-        table = pyarrow.csv.read_csv(path, **_csv_options(header), convert_options=_csv_types(pa, header))
-    else:
-        with _open_parquet(pa, path) as file:
-            check_size(path, file.metadata.num_rows, file.metadata.num_columns, whole=True)
-            nested = NestedColumns(pa, file)
-            plain = nested.in_file([name for name, type_ in nested.types.items() if _is_plain(pa, type_)])
-            table = pa.Table.from_batches([nested.flat(batch) for batch in file.iter_batches(_ROWS, columns=plain)])
-    check_size(path, table.num_rows, table.num_columns, whole=True)
-    return table
+        names = [*header.names, *(["unnamed_last"] if header.is_open else [])]
+        # one thread: else error messages have no row number
+        rows = {"skip_rows": header.lines, "column_names": names, "encoding": header.encoding}
+        marks = {"null_values": _EMPTY, "strings_can_be_null": True, "decimal_point": header.decimal_mark}
+        with self._path.open("rb") as stream:
+            try:
+                yield from pyarrow.csv.open_csv(
+                    stream,
+                    read_options=pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES, **rows),
+                    parse_options=pyarrow.csv.ParseOptions(delimiter=header.separator),
+                    convert_options=pyarrow.csv.ConvertOptions(
+                        column_types=types, include_columns=list(sources), **marks
+                    ),
+                )
+            except self._pa.ArrowInvalid as error:
+                raise self._bad_cell(header, names, error) or error from error
 
+    def _bad_cell(self, header: TextHeader, names: Sequence[str], error: Exception) -> LogError | None:
+        """The error of a cell that is no number, or of a row with too many cells or too few; None for any other."""
+        if row := _SHORT_ROW.match(str(error)):
+            return LogError(self._path, f"row {row[1]}", f"{row[3]} cells", f"{row[2]} cells, as there are names")
+        bad = _BAD_CELL.match(str(error))
+        if bad is None:
+            return None
+        where = "" if bad[2] is None else f" in row {bad[2]}"
+        accepted = f"{_NUMBERS}, with the decimal mark '{header.decimal_mark}'"
+        return LogError(
+            self._path, f"column '{names[int(bad[1])]}'", f"'{excerpt(bad[3].rstrip(chr(39)))}'{where}", accepted
+        )
 
-def _count_bytes(pa: Any, path: Path) -> int:
-    """Bytes of a table's numbers, without reading them."""
-    if is_text_table(path) or _is_json(path):
-        columns = len(read_header(path).texts if is_text_table(path) else _first_lines(path))
-        with path.open("rb") as stream:
-            return 8 * columns * sum(piece.count(b"\n") for piece in iter(lambda: stream.read(BLOCK), b""))
-    import pyarrow.parquet
+    def _json_table(self) -> Any:
+        import pyarrow.json
 
-    with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-        return 8 * int(file.metadata.num_rows) * int(file.metadata.num_columns)
+        options = pyarrow.json.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES)
+        return pyarrow.json.read_json(self._path, read_options=options)
 
-
-def write_table(pa: Any, path: Path, columns: Mapping[str, NDArray[Any]], as_parquet: bool) -> None:
-    """Write columns as Parquet or CSV."""
-    if as_parquet:
+    @contextmanager
+    def _parquet(self) -> Iterator[Any]:
         import pyarrow.parquet
 
-        table = pa.table({text: pa.array(np.ascontiguousarray(x)) for text, x in columns.items()})
-        pyarrow.parquet.write_table(table, path, use_dictionary=[TEXT_COLUMN], write_page_checksum=True)
-    else:
-        _save_csv(pa, path, columns)
+        with pyarrow.parquet.ParquetFile(self._path, **_PARQUET) as file:
+            yield file
+
+    def _flat(self, table: Any) -> Any:
+        """A table with the columns inside of others in the place of these; LogError for lists of several lengths."""
+        types = self._pa.types
+        while any(types.is_struct(field.type) for field in table.schema):
+            table = table.flatten()
+        if not any(types.is_nested(field.type) for field in table.schema):
+            return table
+        out = list[tuple[str, Any]]()
+        for name, column in zip(table.column_names, table.columns, strict=True):
+            numbers = self._numbers_of_lists(name, column)
+            if numbers is None:
+                out.append((name, column))
+                continue
+            for k, values in enumerate(numbers.T):
+                self._origin[f"{name}[{k}]"] = name
+                out.append((f"{name}[{k}]", self._pa.chunked_array([np.ascontiguousarray(values)])))
+        return self._pa.Table.from_arrays([column for _, column in out], [name for name, _ in out])
+
+    def _numbers_of_lists(self, name: str, column: Any) -> NDArray[Any] | None:
+        """Numbers (N, k) of a column of lists, NaN where there is no list; None of others than lists of numbers."""
+        types, type_ = self._pa.types, column.type
+        is_list = types.is_list(type_) or types.is_large_list(type_) or types.is_fixed_size_list(type_)
+        if not is_list or not types.is_primitive(type_.value_type):
+            return None
+        lists = column.combine_chunks()
+        valid = np.asarray(lists.is_valid())
+        lengths = np.unique(np.asarray(self._pa.compute.list_value_length(lists.drop_null())))
+        expected = self._lengths.setdefault(name, int(lengths[0]) if len(lengths) else 0)
+        if len(lengths) > 1 or (len(lengths) and lengths[0] != expected):
+            if not self._origin.get(f"{name}[0]"):
+                return None  # lists of several lengths, which nobody may need
+            found = f"lists of {expected} and of {lengths[lengths != expected][0]} numbers"
+            raise LogError.at_field(f"column '{name}'", found, "lists of one length")
+        if not 0 < expected <= MAX_LIST:
+            return None
+        flat = lists.drop_null().flatten().to_numpy(zero_copy_only=False)
+        out = np.full((len(lists), expected), np.nan, dtype=flat.dtype if valid.all() else np.float64)
+        out[valid] = flat.reshape(-1, expected)
+        return out
+
+    def _values(self, name: str, column: Any) -> NDArray[Any] | None:
+        """Numbers (N,) of a column, of dates seconds since 1970, NaN for empty cells; or texts; None for others."""
+        types, type_ = self._pa.types, column.type
+        if types.is_null(type_):
+            return np.full(len(column), np.nan)
+        if types.is_timestamp(type_) or types.is_time(type_) or types.is_duration(type_):
+            whole = column.cast(self._pa.int32() if type_.bit_width == 32 else self._pa.int64())
+            return np.asarray(whole.combine_chunks().to_numpy(zero_copy_only=False) / _PER_SECOND[type_.unit])
+        if types.is_integer(type_) or types.is_floating(type_) or types.is_boolean(type_):
+            column = column.cast(self._pa.float64()) if types.is_boolean(type_) and column.null_count else column
+            return np.asarray(column.combine_chunks().to_numpy(zero_copy_only=False))
+        if types.is_dictionary(type_):
+            column = column.cast(type_.value_type)
+        if not types.is_string(column.type) and not types.is_large_string(column.type):
+            return None
+        coded = column.combine_chunks().dictionary_encode()
+        words = coded.dictionary.to_pylist()
+        longest = max(map(len, words), default=0)
+        if name == TEXT_FIELD:
+            check_names([1], longest)
+        if longest > MAX_LETTERS:
+            return None
+        codes = np.asarray(coded.indices.fill_null(len(words)))
+        return np.array([*words, ""])[codes]
 
 
-# ----------------------------------------------------------------------------------------------------------------- CSV
+@contextmanager
+def serve_table(path: Path) -> Iterator[_Served]:
+    """Open a table in the process that reads it."""
+    yield _Served(path)
 
 
-def _stamp_types(pa: Any, header: TextHeader) -> dict[str, Any]:
-    """Types of the columns of a table of text that hold dates or times of day."""
-    dates = {name: pa.timestamp("ns", "UTC" if zone else None) for name, zone in header.dates.items()}
-    return dates | dict.fromkeys(header.times_of_day, pa.time64("ns"))
+# ------------------------------------------------------------------------------------------------------------- writing
 
 
-def _csv_options(header: TextHeader) -> dict[str, Any]:
-    """Options of pyarrow's readers of CSV, but for types of columns."""
-    import pyarrow.csv
-
-    # one thread: else error messages have no row number
-    rows = {"skip_rows": header.lines, "column_names": header.texts, "encoding": header.encoding}
-    return {
-        "read_options": pyarrow.csv.ReadOptions(use_threads=False, block_size=BLOCK, **rows),
-        "parse_options": pyarrow.csv.ParseOptions(delimiter=header.separator),
-    }
-
-
-def _csv_types(pa: Any, header: TextHeader, **others: Any) -> Any:
-    import pyarrow.csv
-
-    types = others.pop("column_types", None) or _stamp_types(pa, header)
-    marks = {"null_values": _EMPTY, "strings_can_be_null": True, "decimal_point": header.decimal_mark}
-    return pyarrow.csv.ConvertOptions(column_types=types, **marks, **others)
-
-
-def _sample_csv(pa: Any, path: Path) -> tuple[list[str], Any]:
-    import pyarrow.csv
-
-    header = read_header(path)
-    check_header(header.texts)
-    if header.is_all:
-        return header.texts, None
-    with path.open("rb") as stream:
-        reader = pyarrow.csv.open_csv(stream, **_csv_options(header), convert_options=_csv_types(pa, header))
-        return header.texts, reader.read_next_batch()
-
-
-def _read_csv(
-    pa: Any, path: Path, sources: Collection[str], texts: Collection[str], only: bool, whole: bool
-) -> Iterator[Any]:
-    import pyarrow.csv
-
-    header = read_header(path)
-    if header.is_all:
-        return
-    words = pa.dictionary(pa.int32(), pa.string())
-    types = {text: words if text in texts else pa.float64() for text in sources}
-    types |= {text: type_ for text, type_ in _stamp_types(pa, header).items() if text in types}
-    included = list(sources) if only or header.is_open else None
-    convert = _csv_types(pa, header, column_types=types, include_columns=included)
-    with path.open("rb") as stream:
-        try:
-            reader = pyarrow.csv.open_csv(stream, **_csv_options(header), convert_options=convert)
-            yield from _bounded(path, reader, len(types), whole)
-        except pa.ArrowInvalid as error:
-            if (bad := _bad_cell(path, header, error)) is None:
-                raise
-            raise bad from error
-
-
-def _bad_cell(path: Path, header: TextHeader, error: Exception) -> LogError | None:
-    """The error of a cell that is no number, or of a row with too many cells or too few; None for any other."""
-    if row := _SHORT_ROW.match(str(error)):
-        return LogError(path, f"row {row[1]}", f"{row[3]} cells", f"{row[2]} cells, as there are names")
-    bad = _BAD_CELL.match(str(error))
-    if bad is None:
-        return None
-    column, row_number, found = bad.groups()
-    where = "" if row_number is None else f" in row {row_number}"
-    found = found.strip(_QUOTES)
-    other = "." if header.decimal_mark == "," else ","
-    mixed = found.count(other) == 1 and found.replace(other, "").lstrip("-").isdigit()
-    accepted = f"the decimal mark '{header.decimal_mark}' throughout, as in other rows" if mixed else _NUMBERS
-    return LogError(path, f"column '{header.texts[int(column)]}'", f"'{excerpt(found)}'{where}", accepted)
-
-
-# ------------------------------------------------------------------------------------------------------------- Parquet
-
-
-def _sample_parquet(pa: Any, path: Path) -> tuple[list[str], Any]:
-    with _open_parquet(pa, path) as file:
-        nested = NestedColumns(pa, file)
-        check_header(nested.names)
-        check_size(path, file.metadata.num_rows, len(nested.names), whole=False)
-        plain = [name for name, type_ in nested.types.items() if _is_plain(pa, type_)]
-        batch = next(file.iter_batches(_SAMPLE, columns=nested.in_file(plain)), None) if plain else None
-    return nested.names, None if batch is None else nested.flat(batch)
-
-
-def _open_parquet(pa: Any, path: Path, texts: Collection[str] | None = None) -> Any:
-    """An open file, whose texts are dictionaries: one long text, repeated in every row, could fill the memory."""
+def write_parquet(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write columns (N,) of numbers and texts."""
     import pyarrow.parquet
 
-    with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-        types = NestedColumns(pa, file).types
-    words = [name for name, type_ in types.items() if _is_text(pa, type_) and (texts is None or name in texts)]
-    return pyarrow.parquet.ParquetFile(path, read_dictionary=words or None, **_PARQUET)
+    table = pyarrow.table({name: pyarrow.array(np.ascontiguousarray(x)) for name, x in columns.items()})
+    pyarrow.parquet.write_table(table, path, use_dictionary=[TEXT_FIELD], write_page_checksum=True)
 
 
-def _is_plain(pa: Any, type_: Any) -> bool:
-    return is_number(pa, type_) or is_stamp(pa, type_) or _is_text(pa, type_)
-
-
-def _read_parquet(
-    pa: Any, path: Path, sources: Collection[str], texts: Collection[str], only: bool, whole: bool
-) -> Iterator[Any]:
-    with _open_parquet(pa, path, texts) as file:
-        used, nested = set(sources), NestedColumns(pa, file)
-        for name, type_ in nested.types.items():
-            number = is_number(pa, type_) and (name in texts or not pa.types.is_boolean(type_))
-            number = (number or is_stamp(pa, type_)) and name != TEXT_COLUMN
-            if name in used and not number and not (name in texts and pa.types.is_dictionary(type_)):
-                accepted = "text" if name == TEXT_COLUMN else "real numbers"
-                raise LogError(path, f"column '{name}'", f"values of type {type_}", accepted)
-        check_size(path, file.metadata.num_rows, len(used), whole)
-        included = nested.in_file(sources) if only else None
-        for batch in _bounded(path, file.iter_batches(_ROWS, columns=included), len(used), whole):
-            yield nested.flat(batch)
-
-
-def _is_text(pa: Any, type_: Any) -> bool:
-    return bool(pa.types.is_string(type_) or pa.types.is_large_string(type_) or pa.types.is_dictionary(type_))
-
-
-# ---------------------------------------------------------------------------------------------------------- JSON lines
-
-
-def _first_lines(path: Path) -> JsonColumns:
-    """The first lines of JSON, by column; LogError where there is none."""
-    return next(read_json_lines(path, _LINES, partial(check_size, path, whole=False)), {})
-
-
-def _read_json(
-    pa: Any, path: Path, sources: Collection[str], texts: Collection[str], only: bool, whole: bool
-) -> Iterator[Any]:
-    known = set(_first_lines(path))
-    for block in read_json_lines(path, _LINES, partial(check_size, path, whole=whole)):
-        if later := [name for name in block if name not in known]:
-            accepted = f"the same in each line, null where nothing was measured; the first {_LINES} lines tell which"
-            raise LogError(path, f"column '{excerpt(later[0])}'", "in none of the first lines", accepted)
-        for name, values in block.items():
-            if name in sources and isinstance(values, list) != (name in texts) and isinstance(values, list):
-                found = next((text for text in values if text is not None), "")
-                raise LogError(path, f"column '{name}'", f"'{excerpt(found)}'", _NUMBERS)
-        yield _json_batch(pa, block, sources)
-
-
-def _json_batch(pa: Any, block: JsonColumns, names: Iterable[str]) -> Any:
-    """Columns of some lines, NaN for those that no line has."""
-    count = len(next(iter(block.values()), ()))
-    words = pa.dictionary(pa.int32(), pa.string())
-    columns = {name: block.get(name, np.full(count, np.nan)) for name in names}
-    made = {name: pa.array(x, words if isinstance(x, list) else pa.float64()) for name, x in columns.items()}
-    return pa.RecordBatch.from_pydict(made)
-
-
-def _sample_json(pa: Any, path: Path) -> tuple[list[str], Any]:
-    columns = _first_lines(path)
-    check_header(list(columns))
-    return list(columns), _json_batch(pa, columns, columns) if columns else None
-
-
-# --------------------------------------------------------------------------------------------------------------- sizes
-
-
-def _bounded(path: Path, batches: Iterable[Any], columns: int, whole: bool) -> Iterator[Any]:
-    """The batches, with their total size checked: a file may contain more rows than it declares."""
-    rows = 0
-    for batch in batches:
-        rows += batch.num_rows
-        check_size(path, rows, columns, whole)
-        if batch.num_rows:
-            yield batch
-
-
-def check_size(path: Path, rows: int, columns: int, whole: bool) -> None:
-    """Raise LogError for more numbers than are read whole, or than a file of that size has."""
-    if whole and 8 * rows * columns > MAX_ARRAYS:
-        accepted = f"at most {MAX_ARRAYS} bytes in all"
-        raise LogError(path, "file", f"{rows} rows of {columns} columns", accepted)
-    check_unpacked_size(path, 8 * rows * columns)
-
-
-def _save_csv(pa: Any, path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+def write_csv(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write numbers as the shortest exact text, NaN as an empty cell."""
     import pyarrow.csv
 
     def rows(first: int) -> Any:
-        block = {text: x[first : first + _ROWS] for text, x in columns.items()}
-        return pa.table({text: pa.array(np.ascontiguousarray(x), from_pandas=True) for text, x in block.items()})
+        block = {text: x[first : first + _BATCH_ROWS] for text, x in columns.items()}
+        return pyarrow.table(
+            {name: pyarrow.array(np.ascontiguousarray(x), from_pandas=True) for name, x in block.items()}
+        )
 
     with path.open("xb") as stream, pyarrow.csv.CSVWriter(stream, rows(0).schema) as writer:
-        for first in range(0, len(columns["time"]), _ROWS):
+        for first in range(0, len(columns["time"]), _BATCH_ROWS):
             writer.write_table(rows(first))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import ConfigError, LogError, format_count
+from torchid.errors import ConfigError, LogError
 from torchid.logs.quaternion import require_unit
 
 if TYPE_CHECKING:
@@ -162,8 +162,6 @@ def register(store: Any, parse: Any) -> None:
 
 
 _KEY = "logs.topics.low_state"
-#: [rad] less is no motion of a motor that a robot is said not to have.
-_MOVED = 1e-3
 #: Ticks may be off the times of receipt by this [ns], and by this share of the log: a network stalls, a clock drifts.
 _OFF, _OFF_SHARE = 100_000_000, 0.01
 _MILLISECOND, _WRAP = 1_000_000, 1 << 32
@@ -179,7 +177,6 @@ class LowState:
         self._topic, self._settings = topic.topic, topic
         self._order = list(topic.order)
         self.names = tuple(name for name in self._order if name is not None)
-        self._motors = 0
 
     def check_options(self, field: str, kind: str) -> None:
         """Refuse settings, of a field, that messages of a type do not fit.
@@ -209,20 +206,18 @@ class LowState:
             found = f"mode_pr {message.mode_pr}: ankles and waist by their parallel motors (A, B), not by joint"
             raise LogError.at_field(self._topic, found, "messages with mode_pr 0: pitch and roll")
         motors, imu = message.motor_state, message.imu_state
-        self._motors = len(motors)
         values = [*(x.q for x in motors), *(x.dq for x in motors), *(x.tau_est for x in motors)]
         arrays = imu.accelerometer, imu.gyroscope, imu.quaternion, getattr(message, "foot_force", np.array([]))
         return np.array([*values, *(x for array in arrays for x in array.tolist())], dtype=np.float64)
 
-    def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
+    def fields(self, rows: FloatArray, kind: str) -> dict[str, FloatArray]:
         """Fields (N, n) of the joints, (N, 3) and (N, 4) of the IMU, and the raw readings of feet (N, 4), if any.
 
         Raises:
-            LogError: a joint whose motor is not there, a motor that moves without a joint, or quaternions of no length.
+            LogError: quaternions of no length.
         """
-        count = self._motors
+        count = MOTORS[kind]
         motors = rows[:, : 3 * count].reshape(len(rows), 3, count)
-        self._check_motors(motors)
         joints = motors[:, :, [number for number, name in enumerate(self._order) if name is not None]]
         out = dict(zip(("joint_position", "joint_velocity", "joint_torque"), joints.transpose(1, 0, 2), strict=True))
         if self._settings.frame is not None:
@@ -232,34 +227,6 @@ class LowState:
         if rows.shape[1] > 3 * count + 10:
             out["foot_force"] = rows[:, 3 * count + 10 :]
         return out
-
-    def _check_motors(self, motors: FloatArray) -> None:
-        """Refuse an order that the motors which are alive do not have; motors (N, 3, count)."""
-        alive = np.asarray(np.any(motors != 0.0, axis=(0, 1)))
-        listed = [*self._order, *[None] * (len(alive) - len(self._order))]
-        name = self._settings.robot
-        with np.errstate(invalid="ignore"):  # of infinite positions
-            moves = np.ptp(motors[:, 0], axis=0) > _MOVED
-        for number, joint in enumerate(listed):
-            if joint is not None and not alive[number]:
-                found = f"motor {number}, '{joint}', is 0 throughout: no such motor"
-                raise LogError.at_field(self._topic, found, self._others(alive, number))
-            if joint is None and moves[number] and (name is not None or number >= len(self._order)):
-                owner = f"'{name}' has" if name is not None else f"{_KEY}.joints names"
-                found = f"motor {number} moves, where {owner} no joint"
-                raise LogError.at_field(self._topic, found, self._others(alive, number))
-
-    def _others(self, alive: NDArray[np.bool_], number: int) -> str:
-        """The robots that have the motors which are alive, or what else may be said of a motor."""
-        kind = next(kind for kind, count in MOTORS.items() if count == len(alive))
-        numbers = set(np.flatnonzero(alive).tolist())
-        fitting = [
-            name
-            for name, order in JOINT_ORDERS.items()
-            if order.message == kind and {i for i, joint in enumerate(order.joints) if joint} == numbers
-        ]
-        listed = f"{_KEY}.joints with a name or null for each of {format_count(len(alive), 'motor')}"
-        return f"{_KEY}.robot: {' or '.join(fitting)}" if fitting else f"{listed}, null for motor {number} where unused"
 
     def _orientation(self, wxyz: FloatArray) -> dict[str, FloatArray]:
         """The base's orientation; nothing where quaternions are always the same, as of a driver that does not set them.

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchid.logs.column_map import fits
+from torchid.logs.columns import fits
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet

@@ -6,7 +6,7 @@ import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress, permutations
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -14,37 +14,40 @@ from numpy.typing import NDArray
 
 from torchid.errors import excerpt, format_count
 from torchid.logs.arrays import TRANSPOSED
-from torchid.logs.column_entries import OF_FILE
-from torchid.logs.column_map import FILL_IN, PLACEHOLDER, fits
-from torchid.logs.columns import is_column
+from torchid.logs.columns import FILL_IN, OF_FILE, PLACEHOLDER, fits
 from torchid.logs.log import SHAPES, VARIANTS, WRENCHES
-from torchid.logs.name_matching import (
+from torchid.logs.schema import native_field
+from torchid.logs.units import UNITS, quantities_of, quantities_with, split_unit, unit_factor
+from torchid.proposals.names import (
     BASES,
     NEUTRAL,
     QUANTITIES,
-    UNNAMED,
+    RobotNames,
+    Spelling,
+    exchange_affixes,
+    find_spelling,
     is_measured,
     join_pairs,
     quantity_of,
+    usual_order,
+    within,
     words_of,
 )
-from torchid.logs.units import IN_DEGREES, UNITS, quantities_of, quantities_with, split_unit, unit_factor
-from torchid.proposals.names import RobotNames, Spelling, exchange_affixes, find_spelling, usual_order, within
-from torchid.proposals.samples import FileSample, increases, numbers_of, slope_fit, stated_names
+from torchid.proposals.samples import FileSample, increases, numbers_of, stated_names
 
 _AXIS = re.compile(r"(?:(?<![A-Za-z])[a-z]?([wxyz])|(?:(?<![A-Za-z])[A-Z]?|(?<=[a-z]))([WXYZ]))(?![A-Za-z0-9])")
 _LAST_NUMBER = re.compile(r"\d+(?!.*\d)")
-_RPY = ("roll", "pitch", "yaw")
 _OF_JOINTS = {
     "position": "joint_position", "velocity": "joint_velocity", "angular velocity": "joint_velocity",
     "acceleration": "joint_acceleration", "specific force": "joint_acceleration", "torque": "joint_torque",
     "moment": "joint_torque",
 }  # fmt: skip
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
-_TOUCH = 0.05  # of the robot's weight, what a contact bears at least
+TOUCH_WEIGHT = 0.05
+"""Share of the robot's weight that a contact bears at least."""
+
 _TURN = 7.0  # [rad]: beyond this, angles are in degrees
 _STEPS_S = (2e-4, 0.2)  # between samples of recordings
-_ALIKE, _SAME_UNIT = 0.9, 1.15  # correlation and ratio of velocities and slopes of positions
 
 
 @dataclass(frozen=True)
@@ -127,18 +130,15 @@ class MapProposal:
     fields: set[str] = field(default_factory=set)
 
 
-def propose_map(
-    sample: FileSample, robot: RobotNames, files: Sequence[FileSample] = (), in_degrees: Collection[str] = ()
-) -> MapProposal:
+def propose_map(sample: FileSample, robot: RobotNames, files: Sequence[FileSample] = ()) -> MapProposal:
     """Sort foreign columns into fields of a log by what they are called.
 
     Args:
         sample: from `read_sample`.
         robot: whose log it is.
         files: samples of each of several files that are one log.
-        in_degrees: columns of files whose header says that angles are in degrees.
     """
-    return _Proposer(sample, robot, files, in_degrees).propose()
+    return _Proposer(sample, robot, files).propose()
 
 
 def find_families(sample: FileSample, robot: RobotNames) -> tuple[list[Family], dict[str, Spelling]]:
@@ -205,11 +205,9 @@ def _family(members: Sequence[Mapping[str, Any]], spelled: Mapping[str, Spelling
 
 
 class _Proposer:
-    def __init__(
-        self, sample: FileSample, robot: RobotNames, files: Sequence[FileSample], in_degrees: Collection[str]
-    ) -> None:
-        self.sample, self.robot, self.files, self.in_degrees = sample, robot, files, in_degrees
-        native = {name for name in sample if is_column(name) or name in (*SHAPES, *VARIANTS)}
+    def __init__(self, sample: FileSample, robot: RobotNames, files: Sequence[FileSample]) -> None:
+        self.sample, self.robot, self.files = sample, robot, files
+        native = {name for name in sample if native_field(name) or name in (*SHAPES, *VARIANTS)}
         self.foreign = {name: x for name, x in sample.items() if name not in native}
         numeric = {name: x for name, x in self.foreign.items() if x is not None and x.dtype.kind in "fiub" and x.size}
         self.families, self.spelled = find_families(numeric, robot)
@@ -221,13 +219,10 @@ class _Proposer:
         self.stated = stated if set(stated) <= set(robot.joints) else []
 
     def propose(self) -> MapProposal:
-        if all(UNNAMED.fullmatch(name) for name in self.sample):
-            self._place_unnamed()
-        else:
-            self._place_joints()
-            self._place_base()
-            self._place_contacts()
-            self._place_law()
+        self._place_joints()
+        self._place_base()
+        self._place_contacts()
+        self._place_law()
         self._place_time()
         self._settle_units()
         self._ask()
@@ -280,8 +275,7 @@ class _Proposer:
         """The field of the joints that a family is, "" for none."""
         name = _OF_JOINTS.get(family.quantity, "")
         if family.kind == "joint":
-            is_bare = not family.words and not family.unit and family.columns[0] in self.in_degrees  # of OpenSim
-            return "" if family.axes or family.shape not in ((), (1,)) else "joint_position" if is_bare else name
+            return "" if family.axes or family.shape not in ((), (1,)) else name
         is_other = family.kind or family.axes or family.unknown_words() or len(family.shape) > 1
         return "" if is_other or self._order_of("joint", family) is None else name
 
@@ -375,8 +369,6 @@ class _Proposer:
                 self._add(name, best, best.entry)
                 if name.startswith("base_quat") and "imu" in best.words:
                     self.out.assumed[name] = "of the IMU, taken to be that of the base link"
-        if not self._is_turned:
-            self._place_angles(of_base)
         if all(map(self._known, imu)) and not self._known("imu_frame"):
             self.out.columns["imu_frame"], self.out.assumed["imu_frame"] = self.robot.imu_frame()
 
@@ -404,29 +396,6 @@ class _Proposer:
             family.quantity, ""
         )
 
-    def _place_angles(self, of_base: Collection[str]) -> None:
-        """Roll, pitch and yaw of the base, three columns or an array called `rpy`."""
-        names = {*of_base, *_RPY, "rpy", "euler", "angles", "angle"}
-        alone = [family for family in self.families if not family.kind and not family.unknown_words(names)]
-        by_angle = {x: [family for family in alone if x in family.words and family.count == 1] for x in _RPY}
-        arrays = [family for family in alone if "rpy" in family.words and family.count == 3 and family.shape == (3,)]
-        if all(len(families) == 1 for families in by_angle.values()):
-            used = [families[0] for families in by_angle.values()]
-            entry: dict[str, Any] = {"columns": {x: y.columns[0] for x, y in zip(_RPY, used, strict=True)}}
-        elif len(arrays) == 1:
-            used, entry = arrays, arrays[0].entry
-        else:
-            return
-        self.used += used
-        values = numbers_of(self.sample, [x for family in used for x in family.columns])
-        self._add_unit("joint_position", used[0], entry)
-        note = "about the world's x, then y, then z, as in a URDF"
-        if "unit" not in entry and not used[0].unit and np.nanmax(np.abs(values), initial=0.0) > _TURN:
-            entry["unit"] = "deg"
-            note += f"; deg, from values up to {np.nanmax(np.abs(values)):.3g}"
-        self.out.columns["base_quat_wxyz"] = {"rpy": entry}
-        self.out.assumed["base_quat_wxyz"] = note
-
     # -------------------------------------------------------------------------------------------------------- contacts
 
     def _place_contacts(self) -> None:
@@ -449,8 +418,8 @@ class _Proposer:
             del self.out.columns[wrench]
         self._place_flags(feet)
         if wrench in self.out.columns and not self._known("contact_active"):
-            self.out.columns["contact_active"] = {"above": float(f"{_TOUCH * self.robot.weight:.2g}")}
-            self.out.assumed["contact_active"] = f"above {_TOUCH:.0%} of the robot's weight [N], by the wrenches"
+            self.out.columns["contact_active"] = {"above": float(f"{TOUCH_WEIGHT * self.robot.weight:.2g}")}
+            self.out.assumed["contact_active"] = f"above {TOUCH_WEIGHT:.0%} of the robot's weight [N], by the wrenches"
         self._add_spelling("contact")
 
     def _add_wrench(self, part: str, family: Family) -> None:
@@ -542,7 +511,7 @@ class _Proposer:
             self.out.assumed[key] = f"{fitting[0]}, from steps of {step:.3g}"
 
     def _place_step(self) -> None:
-        """Stamps by their step: that the file states, else that by which velocities are the slope of positions."""
+        """Stamps by the step that the file states."""
         for name, values in self.sample.items():
             is_step = re.fullmatch(r"(\w+_)?(dt|time_?step)(_s)?", name, re.IGNORECASE) is not None
             if is_step and values is not None and values.dtype.kind in "fiu" and values.size:
@@ -551,62 +520,13 @@ class _Proposer:
                     self.out.columns["time"] = {"step": step}
                     self.out.assumed["time"] = f"steps of '{name}' [s], as nothing has stamps"
                     return
-        position, velocity = (self._values(x) for x in ("joint_position", "joint_velocity"))
-        if position is None or velocity is None or position.shape != velocity.shape:
-            return
-        alike, step = slope_fit(position, velocity)
-        rounded = float(f"{1e3 * step:.2g}")
-        if alike > _ALIKE and _STEPS_S[0] <= step <= _STEPS_S[1]:
-            step_ms = rounded if abs(rounded / (1e3 * step) - 1.0) < 0.01 else float(f"{1e3 * step:.4g}")
-            self.out.columns["time"] = {"step": step_ms, "unit": "ms"}
-            self.out.assumed["time"] = "by the slope of the positions, which are the velocities: nothing has stamps"
-
-    # ------------------------------------------------------------------------------------------------ columns by number
-
-    def _place_unnamed(self) -> None:
-        """Columns of a table without names: stamps, and positions and velocities of all joints, as slopes say."""
-        count, texts = len(self.robot.joints), list(self.foreign)
-        values = numbers_of(self.sample, texts)
-        stamps = [increases(column) for column in values.T]
-        self.families = [
-            Family(x, (x,), "", (), (), (), ("time",) * is_stamp, ("",), ())
-            for x, is_stamp in zip(texts, stamps, strict=True)
-        ]
-        moves = (np.ptp(values, axis=0) > 0.0) & ~np.array(stamps)
-        starts = [k for k in range(len(texts) - count + 1) if count and moves[k : k + count].all()]
-        for first, second in permutations(starts, 2):
-            pairs = zip(values.T[first : first + count], values.T[second : second + count], strict=True)
-            if abs(second - first) < count or min(slope_fit(*pair)[0] for pair in pairs) < _ALIKE:
-                continue
-            for name, start in (("joint_position", first), ("joint_velocity", second)):
-                block = self._block(start, count)
-                self._add(name, block, block.entry)
-                self.out.assumed[name] = (
-                    f"columns {start} to {start + count - 1}, as velocities are slopes of positions"
-                )
-            self._add_order("joint", block)
-            others = [k for k in starts if min(abs(k - first), abs(k - second)) >= count]
-            if others:
-                what = f"if columns {others[0]} to {others[0] + count - 1} are torques"
-                self.out.perhaps.append(("joint_torque", self._block(others[0], count).entry, what))
-            return
-
-    @staticmethod
-    def _block(start: int, count: int) -> Family:
-        numbers = tuple(range(start, start + count))
-        columns = tuple(f"column_{k}" for k in numbers)
-        return Family("column_{index}", columns, "", (), numbers, (), (), ("",) * count, ())
 
     # ------------------------------------------------------------------------------------------------------------ units
 
     def _add_unit(self, name: str, family: Family, entry: dict[str, Any], quantities: tuple[str, ...] = ()) -> None:
         """The unit that the names of columns, or the file's header, say."""
         quantities = quantities or quantities_of(name)
-        if name == "time":
-            return
-        if not any(family.units):
-            if quantities and quantities[0] in IN_DEGREES and family.columns[0] in self.in_degrees:
-                self.out.assumed[name] = f"{IN_DEGREES[quantities[0]]}, as the file's header says (inDegrees=yes)"
+        if name == "time" or not any(family.units):
             return
         other = [x for x in family.units if x and not set(quantities) & set(quantities_with(x))]
         if other and quantities:
@@ -626,36 +546,17 @@ class _Proposer:
         return values if np.isfinite(values).any() else None
 
     def _settle_units(self) -> None:
-        """Degrees, where positions are far beyond a turn, and velocities 57 times their slope."""
+        """Degrees, where positions are far beyond a turn."""
         family, position = self.family_of.get("joint_position"), self._values("joint_position")
         if family is None or position is None:
             return
         entry = self.out.columns["joint_position"]
         hinges = np.array([name not in self.robot.slides for name in family.names] or [True] * position.shape[1])
         largest = np.nanpercentile(np.abs(position[:, hinges]), 98) if hinges.any() else 0.0
-        if largest > _TURN and not any(family.units) and family.columns[0] not in self.in_degrees:
+        if largest > _TURN and not any(family.units):
             of_hinges = {name: "deg" for name, is_hinge in zip(family.names, hinges, strict=False) if is_hinge}
             entry["unit"] = "deg" if hinges.all() else of_hinges
             self.out.assumed["joint_position"] = f"deg, from values up to {np.nanmax(np.abs(position)):.3g}"
-        if not self.files and entry.get("unit") in (None, "deg"):
-            self._settle_velocities(np.radians(position) if "unit" in entry else position)
-
-    def _settle_velocities(self, position: NDArray[np.float64]) -> None:
-        """Degrees per second, by the slope of positions (N, n) [rad]."""
-        family, velocity, seconds = (
-            self.family_of.get("joint_velocity"),
-            *map(self._values, ("joint_velocity", "time")),
-        )
-        if family is None or velocity is None or seconds is None or any(family.units):
-            return
-        if velocity.shape != position.shape or len(seconds) != len(position):
-            return
-        alike, step = slope_fit(position, velocity)
-        unit = UNITS["time"].get(self.out.columns.get("time", {}).get("unit", "s"), 1.0)
-        ratio = unit * float(np.nanmedian(np.diff(seconds[:, 0]))) / max(step, 1e-12)
-        if alike > _ALIKE and 1.0 / _SAME_UNIT < ratio * UNITS["angle"]["deg"] < _SAME_UNIT:
-            self.out.columns["joint_velocity"]["unit"] = "deg/s"
-            self.out.assumed["joint_velocity"] = f"deg/s, as they are {ratio:.3g} times the slope of the positions"
 
     # ---------------------------------------------------------------------------------------- what a person has to say
 
@@ -670,16 +571,9 @@ class _Proposer:
             order = ", ".join(self.robot.joints)
             self.out.hint = f"joints of the robot: {order}; joint_order: [...] gives those of numbered columns"
         forces = ("joint_torque", *WRENCHES, "contact_force_normal", "ft_wrench")
-        if not any(map(self._known, forces)):
-            currents = [
-                x for x in self.families if x.quantity == "current" and x.kind == "joint" and is_measured(x.words)
-            ]
-            for family in currents:
-                entry = family.entry | {"torque_constant": FILL_IN, "gear_ratio": FILL_IN}
-                self.out.perhaps.append(("joint_torque", {"current": entry}, "currents of motors: N m/A, and gears"))
-            if self.robot.joints:
-                self.out.columns["joint_torque"] = {"column": FILL_IN}
-                self.out.assumed["joint_torque"] = "torques [N m]; or {current: ...}, {pd: ...}, contact_wrench_local"
+        if self.robot.joints and not any(map(self._known, forces)):
+            self.out.columns["joint_torque"] = {"column": FILL_IN}
+            self.out.assumed["joint_torque"] = "torques [N m]; or {current: ...}, {pd: ...}, contact_wrench_local"
 
     def _list_others(self) -> None:
         """Columns without an entry: ignored by the map, and listed with their shapes and ranges."""

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import TorchidError, excerpt
+from torchid.errors import excerpt
 from torchid.logs.arrays import TRANSPOSED, fields_of_records, require_plain
+from torchid.logs.bags import ENCODINGS, MESSAGES_ACCEPTED, list_channels, make_deserializer, messages_of
 from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files, open_container, reader_errors_explained
 from torchid.logs.episodes import flat, groups_of, in_groups
-from torchid.logs.name_matching import propose_field
-from torchid.logs.ros_messages import make_deserializer
-from torchid.logs.ros_read import list_channels, open_bag_file
-from torchid.logs.tables import RowNames, sample_table
+from torchid.logs.tables import sample_table
+from torchid.proposals.names import propose_field
 
 FileSample = Mapping[str, NDArray[Any] | None]
 """Columns of a table or arrays with some of their rows, some of them names; None for what is neither."""
@@ -28,14 +27,14 @@ _SORTED = 0.9  # of the steps of stamps, forwards
 _JUMP = 1.0  # [rad or m] from sample to sample: a turn that an encoder jumps by
 
 
-def read_sample(path: Path, rows: RowNames | None = None) -> FileSample:
-    """The columns of a table or the arrays of a file, with some of the rows of tables; `rows` as from `rows_of`.
+def read_sample(path: Path) -> FileSample:
+    """The columns of a table or the arrays of a file, with some of the rows of tables.
 
     Raises:
         LogError: it cannot be read, or is a bag.
     """
     if existing_log_kind(path) is LogKind.TABLE:
-        return sample_table(path, rows)
+        return sample_table(path)
     out: dict[str, NDArray[Any] | None] = {}
     with open_container(path) as container:
         for name in container.declared_bytes():
@@ -77,18 +76,6 @@ def increases(values: NDArray[Any] | None, strictly: bool = True) -> bool:
         return False
     steps = np.diff(np.ravel(values))
     return bool((steps > 0).mean() > _SORTED if strictly else (steps >= 0).mean() > _SORTED and (steps > 0).any())
-
-
-def slope_fit(position: NDArray[Any], velocity: NDArray[Any]) -> tuple[float, float]:
-    """How alike velocities (N, ...) are to the steps of positions (a correlation), and the time between samples."""
-    steps = np.diff(position.astype(float), axis=0)
-    mean = 0.5 * (velocity[1:] + velocity[:-1]).astype(float)
-    steps = np.where(np.abs(steps) > _JUMP, np.nan, steps)
-    with np.errstate(all="ignore"):
-        both, of_steps, of_mean = (np.nansum(x) for x in (steps * mean, steps**2, mean**2 + 0.0 * steps))
-    if not of_steps > 0.0 or not of_mean > 0.0:
-        return 0.0, 0.0
-    return float(both / np.sqrt(of_steps * of_mean)), float(both / of_mean)
 
 
 def with_samples_first(sample: FileSample) -> tuple[FileSample, str]:
@@ -183,24 +170,16 @@ def read_bag_sample(path: Path, types: Collection[str]) -> dict[str, TopicSample
     """Every topic of a bag, and messages of those that have one of some types. Raises LogError: the bag is damaged."""
     files = list_bag_files(path)
     channels = list_channels(files)
-    raw: dict[str, list[bytes]] = {name: [] for name, channel in channels.items() if channel.type in types}
-    counts, steps = dict.fromkeys(channels, 0), dict.fromkeys(channels, 1)
-    for file in files:
-        with open_bag_file(file) as opened:
-            for record in opened.records(raw.keys()):
-                name = record.topic
-                if counts[name] % steps[name] == 0:
-                    raw[name].append(record.data)
-                    if len(raw[name]) > 2 * _MESSAGES:
-                        raw[name], steps[name] = raw[name][::2], 2 * steps[name]
-                counts[name] += 1
-    out = {}
-    with open_bag_file(files[0]):  # whose errors are those of deserializing, too
-        for name, channel in channels.items():
-            try:
-                make = make_deserializer(name, channel)
-                messages = [make(data) for data in raw.get(name, [])]
-            except TorchidError:  # a serialization of others, which may be on a topic that nobody needs
-                messages = []
-            out[name] = TopicSample(channel.type, messages, counts[name])
+    out = {name: TopicSample(channel.type) for name, channel in channels.items()}
+    known = [name for name, channel in channels.items() if channel.type in types and channel.encoding in ENCODINGS]
+    steps = dict.fromkeys(known, 1)
+    decoders = {name: make_deserializer(name, channels[name]) for name in known}
+    for name, _, data, _ in messages_of(files, known):
+        topic = out[name]
+        if topic.count % steps[name] == 0:
+            with reader_errors_explained("file", MESSAGES_ACCEPTED):
+                topic.messages.append(decoders[name](data))
+            if len(topic.messages) > 2 * _MESSAGES:
+                topic.messages, steps[name] = topic.messages[::2], 2 * steps[name]
+        topic.count += 1
     return out

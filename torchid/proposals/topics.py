@@ -8,24 +8,21 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import join_names
-from torchid.logs.column_map import FILL_IN
+from torchid.logs.bags import FLAGS, IMUS, JOINT_STATES, NUMBER_ARRAYS, NUMBERS, ODOMETRIES, WRENCHES
+from torchid.logs.columns import FILL_IN
 from torchid.logs.log import NORM_TOLERANCE
-from torchid.logs.name_matching import is_measured, words_of
-from torchid.logs.ros_messages import ContactFlag, Imu, JointStates, NormalForce, Odometry, Wrench
 from torchid.logs.unitree import JOINT_ORDERS, LowState, suitable_orders
-from torchid.proposals.columns import MapProposal
-from torchid.proposals.names import RobotNames, exchange_affixes, find_spelling, within
+from torchid.proposals.columns import TOUCH_WEIGHT, MapProposal
+from torchid.proposals.names import RobotNames, exchange_affixes, find_spelling, is_measured, within, words_of
 from torchid.proposals.samples import TopicSample
-from torchid.rounding import STD_PER_MAD
 
-_DECODERS = (JointStates, LowState, Imu, Odometry, Wrench, NormalForce, ContactFlag)
-USED_TYPES: frozenset[str] = frozenset(name for decoder in _DECODERS for name in decoder.types)
+USED_TYPES = frozenset(
+    (*JOINT_STATES, *LowState.types, *IMUS, *ODOMETRIES, *WRENCHES, *NUMBERS, *NUMBER_ARRAYS, *FLAGS)
+)
 """Types of messages that a map of topics may have."""
 
 _LOW_RATE = "/lf/"
-_AIR = 0.1  # of the way from the lowest to the highest reading: of a foot in the air
-_SHARES = (0.05, 0.2)  # of that way, a threshold of contact: least and most
-_NOISE = 4.0  # standard deviations of readings in the air that it is above them
+_TOUCH_READING = 0.1  # of the way from the lowest to the highest reading of foot sensors, where a foot touches
 
 
 def propose_topics(sample: Mapping[str, TopicSample], robot: RobotNames) -> MapProposal:
@@ -43,7 +40,6 @@ class _Proposer:
         self.topics, self.robot = topics, robot
         self.out = MapProposal(key="topics")
         self.used: set[str] = set()
-        self.readings: list[Any] = []
 
     def propose(self) -> MapProposal:
         self._place_joints()
@@ -58,9 +54,9 @@ class _Proposer:
         self._place_odometry()
         self._place_orientation()
         self._place_limb_sensors()
-        self._place_by_contact("contact_wrenches", Wrench.types, "contact_wrench_local")
-        self._place_by_contact("contact_force_normal", NormalForce.numbers, "contact_force_normal")
-        self._place_by_contact("contact_active", ContactFlag.types, "contact_active")
+        self._place_by_contact("contact_wrenches", WRENCHES, "contact_wrench_local")
+        self._place_by_contact("contact_force_normal", NUMBERS, "contact_force_normal")
+        self._place_by_contact("contact_active", FLAGS, "contact_active")
         self._complete_flags()
         self.out.listed = [self._line(name) for name in self.topics if name not in self.used]
         return self.out
@@ -68,7 +64,7 @@ class _Proposer:
     def _line(self, name: str) -> str:
         """A topic, its type and what its messages are of, in words."""
         topic, more = self.topics[name], ""
-        if topic.type in JointStates.types and topic.messages:
+        if topic.type in JOINT_STATES and topic.messages:
             more = f": joints {join_names(list(topic.messages[0].name))}"
         elif frame := frame_of(topic):
             more = f": of {frame}"
@@ -94,7 +90,7 @@ class _Proposer:
         """Joint states with most of the robot's joints first, then those of others; the rest is welded."""
         placed, entries = set[str](), list[tuple[str, dict[str, Any]]]()
         sources = dict[tuple[str, tuple[str, ...]], Any]()
-        for name, topic in self._of(JointStates.types).items():
+        for name, topic in self._of(JOINT_STATES).items():
             for message in topic.messages[:50]:
                 sources.setdefault((name, tuple(message.name)), message)
         while sources:
@@ -149,8 +145,9 @@ class _Proposer:
                 self.out.assumed["low_state"] += f"; its IMU at {entry['frame']}"
             feet = JOINT_ORDERS[robot].feet
             readings = np.array([message.foot_force for message in topic.messages]) if feet else np.zeros(1)
-            if set(feet) == set(self.robot.feet) and np.ptp(readings) > 0:
-                entry["above"] = threshold(readings)
+            low, high = np.percentile(readings, (2, 98))
+            if set(feet) == set(self.robot.feet) and high > low:
+                entry["above"] = float(f"{low + _TOUCH_READING * (high - low):.2g}")
                 self.out.fields.add("contact_active")
                 self.out.assumed["low_state"] += "; above, from the range of the readings"
             return
@@ -168,7 +165,7 @@ class _Proposer:
 
     def _place_imu(self) -> None:
         """The IMU whose frame is on the base, else the first that is not said to be of something else."""
-        frames = {name: frame_of(topic) for name, topic in self._of(Imu.types).items()}
+        frames = {name: frame_of(topic) for name, topic in self._of(IMUS).items()}
         frames = {name: frame for name, frame in frames.items() if frame not in self.robot.elsewhere}
         on_base = [name for name, frame in frames.items() if frame in self.robot.on_base]
         if not frames:
@@ -184,7 +181,7 @@ class _Proposer:
 
     def _place_odometry(self) -> None:
         """The pose of the base link, or of what its frame is called."""
-        frames = {name: frame_of(topic) for name, topic in self._of(Odometry.types).items()}
+        frames = {name: frame_of(topic) for name, topic in self._of(ODOMETRIES).items()}
         if not frames:
             return
         ours = [name for name, frame in frames.items() if frame in (self.robot.base_link, "")]
@@ -218,7 +215,7 @@ class _Proposer:
     def _place_limb_sensors(self) -> None:
         """Wrenches of the child link of a fixed joint that is called a sensor, or that name joint or link."""
         entries: dict[str, Any] = {}
-        for name, topic in self._of(Wrench.types).items():
+        for name, topic in self._of(WRENCHES).items():
             frame = frame_of(topic)
             if frame in self.robot.feet:
                 continue
@@ -249,7 +246,6 @@ class _Proposer:
             self.used.add(name)
             if frame not in ("", foot):
                 self.out.assumed[key] = "frames of messages are others, taken to be those of the contacts"
-            self.readings += [_reading(message) for message in topic.messages if key != "contact_active"]
         if entries:
             self.out.columns[key] = {foot: entries[foot] for foot in self.robot.feet if foot in entries}
             self.out.fields.add(field)
@@ -262,8 +258,8 @@ class _Proposer:
         if isinstance(low_state := columns.get("low_state"), dict) and "above" in low_state:
             flagged |= set(self.robot.feet)
         if read - flagged:
-            columns["contact_force_threshold"] = max(threshold(np.abs(self.readings)), 1e-3)
-            self.out.assumed["contact_force_threshold"] = "from the range of the readings"
+            columns["contact_force_threshold"] = max(float(f"{TOUCH_WEIGHT * self.robot.weight:.2g}"), 1.0)
+            self.out.assumed["contact_force_threshold"] = f"{TOUCH_WEIGHT:.0%} of the robot's weight [N]"
         unsaid = [foot for foot in self.robot.feet if foot not in read | flagged]
         if unsaid and (read or flagged):
             columns["contact_active"] = columns.get("contact_active", {}) | dict.fromkeys(unsaid, True)
@@ -272,39 +268,8 @@ class _Proposer:
             self.out.fields.add("contact_active")
 
 
-def threshold(readings: Any) -> float:
-    """A reading above which a contact is probably active, in two digits.
-
-    As low as the readings in the air allow: a foot that is taken to be in the air while it carries some weight
-    falsifies the fit, one that is taken to stand in the air costs samples only.
-
-    Args:
-        readings: (N, C) of the sensors of C contacts, or all of them.
-    """
-    values = np.asarray(readings, dtype=float)
-    if not np.isfinite(values).any():
-        return 0.0
-    low, high = np.percentile(values[np.isfinite(values)], (2, 98))
-    least, most = (low + share * (high - low) for share in _SHARES)
-    above = [least]
-    for column in values.reshape(len(values), -1).T if values.ndim > 1 else [values]:
-        air = column[column < low + _AIR * (high - low)]
-        if len(air):  # its median, as a foot that lands or lifts off passes through
-            middle = np.median(air)
-            above.append(float(middle + _NOISE * STD_PER_MAD * np.median(np.abs(air - middle))))
-    return float(f"{min(max(above), most):.2g}")
-
-
 def frame_of(topic: TopicSample) -> str:
     """The frame that the first message says it is of, "" for none."""
     message = topic.messages[0] if topic.messages else None
     frame = getattr(message, "child_frame_id", "") or getattr(getattr(message, "header", None), "frame_id", "")
     return str(frame).removeprefix("/")
-
-
-def _reading(message: Any) -> float:
-    """A force, or its length."""
-    if hasattr(message, "data"):
-        return float(message.data)
-    force = message.wrench.force if hasattr(message, "wrench") else message.force
-    return float(np.linalg.norm([force.x, force.y, force.z]))
