@@ -1,13 +1,10 @@
-"""Mistakes of sign, frame, unit and order in logs, and a table of who notices them: `check`, `identify`, nobody."""
+"""Mistakes of sign, frame, unit and order in logs, and a table of those that `check` names."""
 
 from __future__ import annotations
 
 import re
-import tempfile
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,12 +13,9 @@ from scipy.spatial.transform import Rotation
 from synthetic import Array, Oracle
 from walking import Machine, Truth, recorded, robot_of, specific_force, truth
 
-from torchid.commands.identify import identify
-from torchid.config import load_config
-from torchid.errors import TorchidError
 from torchid.log_checks import NOTE, Checked
 from torchid.log_checks.check import check
-from torchid.logs import Log, write_log
+from torchid.logs import Log
 from torchid.logs.quaternion import make_sign_continuous
 
 SENSORS = ("full", "contacts", "joints")
@@ -306,37 +300,6 @@ def judged(mistake: Mistake, found: Checked, clean: Checked) -> str:
     return SEEN if new else SILENT
 
 
-STOPS, WARNS, PASSES = "stops", "warns", "passes"
-
-
-def identified(case: Case, log: Log, sensors: str) -> set[str] | None:
-    """Beginnings of the warnings that `identify` gives of a log, None where it stops with an error."""
-    with tempfile.TemporaryDirectory() as name, warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        folder = Path(name)
-        write_log(log, folder / "log.npz")
-        machine = case.machine
-        feet = ", ".join(f"{{frame: {foot}, type: {machine.kind}}}" for foot in machine.feet)
-        (folder / "experiment.yaml").write_text(
-            f"robot: {{urdf: {machine.urdf}, fixed_base: {str(machine.bolted).lower()}}}\n"
-            f"contacts: [{feet}]\nlogs: {{train: [log.npz], test: [log.npz]}}\n"
-            f"preprocessing: {{cutoff_hz: {CUTOFF}}}\n"
-            f"sensors: {_sensors(machine, log, sensors)}\n"
-        )
-        try:
-            identify(load_config(folder / "experiment.yaml", (f"output={folder / 'run'}",)))
-        except TorchidError:
-            return None
-    return {re.sub(r"[-+0-9.e]+", "#", str(one.message))[:60] for one in caught}
-
-
-def _sensors(machine: Machine, log: Log, sensors: str) -> str:
-    if not machine.bolted:
-        return f"{{set: {sensors}}}"
-    known = np.isfinite(value(log.joint_torque)).all(axis=0)
-    return f"{{joint_torques: [{', '.join(np.array(log.joint_names)[known])}]}}"
-
-
 @dataclass(frozen=True)
 class Cell:
     """One mistake in one log."""
@@ -345,31 +308,18 @@ class Cell:
     machine: str
     sensors: str
     check: str
-    identify: str
-    findings: tuple[str, ...]
 
 
-def cells(
-    machines: Iterable[Machine], sensors: Sequence[str] = SENSORS, mistakes: Sequence[Mistake] = MISTAKES,
-    identifies: bool = False, seed: int = 0,
-) -> Iterator[Cell]:  # fmt: skip
+def cells(machines: Iterable[Machine]) -> Iterator[Cell]:
     """All cells of the table."""
     for machine in machines:
-        for which in sensors:
-            case = case_of(machine, which, seed)
-            clean, usual = checked(case, case.log), identified(case, case.log, which) if identifies else None
-            for mistake in mistakes:
+        for which in SENSORS:
+            case = case_of(machine, which)
+            clean = checked(case, case.log)
+            for mistake in MISTAKES:
                 log = mistake.make(case)
-                if log is None:
-                    yield Cell(mistake.name, machine.name, which, ABSENT, ABSENT, ())
-                    continue
-                found = checked(case, log)
-                text = tuple(f"{x.severity} {x.field} {x.name}: {x.found}" for x in found.findings)
-                run = ABSENT
-                if identifies:
-                    warned = identified(case, log, which)
-                    run = STOPS if warned is None else WARNS if warned - (usual or set()) else PASSES
-                yield Cell(mistake.name, machine.name, which, judged(mistake, found, clean), run, text)
+                said = ABSENT if log is None else judged(mistake, checked(case, log), clean)
+                yield Cell(mistake.name, machine.name, which, said)
 
 
 __all__ = ["MISTAKES", "Case", "Cell", "Mistake", "cells"]

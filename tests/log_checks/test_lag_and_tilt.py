@@ -78,19 +78,6 @@ def test_a_torque_that_is_off_by_a_constant_is_named_with_its_size(robot: tuple[
     assert "sensors.offsets: {joint_torque: log}" in finding.advice
 
 
-@pytest.mark.parametrize(("robot", "share"), each_once([("arm", "contacts"), ("quadruped", "full")], [0.4, -0.4]))
-def test_a_torque_that_drifts_is_named_with_how_far(robot: tuple[str, str], share: float) -> None:
-    case = case_of(MACHINES[robot[0]], robot[1])
-    torque, time = value(case.log.joint_torque).copy(), case.log.time
-    drift = share * float(np.sqrt(np.square(torque).mean()))
-    torque[:, 1] += drift * ((time - time[0]) / (time[-1] - time[0]) - 0.5)
-    finding = only(checked(case, replace(case.log, joint_torque=torque)), "drift", "joint_torque")
-    found = re.match(r"(\S+): torques drift by ([+-][\d.]+) \+- ([\d.]+) N m over the log", finding.found)
-    assert found is not None
-    assert found[1] == case.log.joint_names[1]
-    assert float(found[2]) == pytest.approx(drift, abs=max(3.0 * float(found[3]), 0.1 * abs(drift)))
-
-
 @pytest.mark.parametrize("machine", ["quadruped", "biped", "demo"])
 def test_a_world_that_is_tilted_is_named_with_the_angles(machine: str) -> None:
     case: Case | None = None if machine == "demo" else case_of(MACHINES[machine], "full")

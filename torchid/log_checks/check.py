@@ -53,7 +53,7 @@ from torchid.log_checks.readings import (
     check_time_stamps,
 )
 from torchid.log_checks.spikes import check_jumps
-from torchid.log_checks.standing_feet import check_gyroscope, check_standing_feet
+from torchid.log_checks.standing_feet import check_standing_feet
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.low_pass import REACH_PERIODS
@@ -180,7 +180,6 @@ def check(
         results += unclosed or check_loops(compared, robot)
         results += check_standing_feet(compared, robot, contacts, derived)
         results += check_slip(_in_the_air(repaired, filled), robot, contacts, cutoff_hz, derived)
-        results += [] if derived else check_gyroscope(compared, robot, contacts, cutoff_hz)
     if "base_" in derived and robot is not None and _blocking_finding(results) is None:
         compared, unfit = _longest_standing(compared, robot, contacts)
         results += unfit

@@ -1,4 +1,4 @@
-"""Measured forces against the URDF's: signs, units, scales, drift, exchanged joints, and what explains a misfit."""
+"""Measured forces against the URDF's: signs, units, scales, exchanged joints, and what explains a misfit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import stdtr
 
 from torchid.errors import InputError
 from torchid.log_checks.encoders import check_encoders, is_bolted_arm, single_zero_findings
@@ -33,8 +32,6 @@ from torchid.log_checks.model import (
     without_friction,
 )
 from torchid.log_checks.scales import (
-    COMPARED_SAMPLES,
-    CORRELATED_SAMPLES,
     MAX_LEFT,
     MIN_BLOCK_SHARE,
     MIN_UNEXPLAINED_RATIO,
@@ -111,72 +108,7 @@ def _lost_base(samples: Sequence[Samples], builder: RowBuilder) -> Iterator[Find
         yield Finding("does not fit", REJECTED, "sensors", text, advice)
 
 
-#: Blocks of time, of how many samples together: as many times those of other checks, as few are left in each block.
-_BLOCKS, _MORE_SAMPLES = 8, 4
-#: Share of logs without a drift in which one is found.
-_LEVEL = 0.01
-#: Drift over the log, over the rms of all torques, that is reported: as of offsets.
-_MIN_SHARE = 0.1
 _TINY = 1e-9
-
-
-def check_torque_drift(filtered: FilteredLog) -> Iterator[Finding]:
-    """Findings about joints whose torque drifts over the log, for logs that nothing else is wrong with.
-
-    Each joint has an unknown constant torque in each block of time, beside all URDFs near the given one. A drift is
-    told by Student's test of their slope, whose noise is how they scatter about the line: whatever the URDF, friction
-    and noise do in blocks that are alike is in it. The level is divided by the number of joints (Bonferroni).
-
-    Args:
-        filtered: the log.
-    """
-    log, robot = filtered.log, filtered.model.robot
-    if log.joint_torque is None or not np.isfinite(log.joint_torque).any():
-        return
-    with suppress(InputError):  # reported by `check_forces_against_urdf`
-        least = _MIN_SHARE * float(np.sqrt(np.nanmean(np.square(log.joint_torque))))
-        slope, deviation = _slopes(filtered)
-        known = deviation > 0.0
-        chance = 2.0 * stdtr(_BLOCKS - 2, -np.abs(slope[known]) / deviation[known])
-        for joint in np.flatnonzero(known)[chance * robot.n < _LEVEL].tolist():
-            if abs(slope[joint]) > least:
-                name, unit = robot.joint_names[joint], "N" if robot.joint_names[joint] in robot.sliding else "N m"
-                text = f"{name}: torques drift by {slope[joint]:+.2g} +- {deviation[joint]:.1g} {unit} over the log"
-                advice = "let motors warm up, or cut the log into parts with sensors.offsets: {joint_torque: log}"
-                yield Finding("drift", SUSPICIOUS, "joint_torque", text, advice, (name,))
-
-
-def _slopes(filtered: FilteredLog) -> tuple[FloatArray, FloatArray]:
-    """By how much constant torques change over the log, with standard deviations, (n,) each; 0 where unknown."""
-    robot, contacts = filtered.model.robot, filtered.model.contacts
-    samples = bind_some_samples(filtered.pieces, robot, contacts, _MORE_SAMPLES * COMPARED_SAMPLES)
-    rows, n = DeviationRows.of(samples, filtered.model), robot.n
-    if rows is None:
-        return np.zeros(n), np.zeros(n)
-    W, _, K, target = (np.concatenate([part[k] for part in rows.parts]) for k in range(4))
-    time = np.concatenate([part.time.numpy() for part in samples])
-    base, blocks = rows.builder.tree.base_rows, np.array_split(np.argsort(time, kind="stable"), _BLOCKS)
-    steady = W[:, base : base + n].transpose(0, 2, 1)  # (N, r, n)
-    K = K[..., : K.shape[2] - n]  # without constants of the whole log
-    count, H, g = K.shape[2], [], []
-    for number, block in enumerate(blocks):
-        own = np.zeros((len(block), K.shape[1], count + _BLOCKS * n))
-        own[..., :count] = K[block]
-        own[..., count + number * n :][..., :n] = steady[block]
-        A = own.reshape(-1, own.shape[2])
-        H.append(A.T @ A)
-        g.append(A.T @ target[block].reshape(-1))
-    prior = np.full(count + _BLOCKS * n, _TINY * np.trace(sum(H)) / len(H[0]))
-    prior[:count] = _MORE_SAMPLES * CORRELATED_SAMPLES
-    constant = np.linalg.solve(sum(H) + np.diag(prior), -sum(g))[count:].reshape(_BLOCKS, n)
-    middle = np.array([time[block].mean() for block in blocks])
-    at = (middle - middle.mean()) / max(float(np.ptp(time)), _TINY)
-    slope = at @ constant / (at @ at)
-    left = constant - constant.mean(axis=0) - np.outer(at, slope)
-    seen = np.array([np.square(steady[block]).sum(axis=(0, 1)) for block in blocks]).min(axis=0) > 0.0
-    deviation = np.sqrt(np.square(left).sum(axis=0) / ((_BLOCKS - 2) * (at @ at)))
-    return seen * slope, seen * deviation
-
 
 #: Share of the exchange that corrected torques still ask for: a scale or an offset of one of the two asks for others.
 _MAX_SHARE_LEFT = 0.25
@@ -424,7 +356,6 @@ def _misfit_findings(
     if not any(isinstance(item, Finding) for item in torques):
         scaled = list(gain_and_point_findings(log, fit_torque_gains(samples, model), robot))
         found = scaled or single_zero_findings(filtered) or list(check_torque_offsets(filtered))
-        found = found or list(check_torque_drift(filtered))
         yield from found or (common_factor_notes(filtered) if is_bolted_arm(model) else [])
 
 
