@@ -80,7 +80,6 @@ def compare(options: argparse.Namespace) -> None:
     for name, networks in (("rigid bodies alone", None), ("with networks", beside)):
         trainer = Trainer(settings, problem, MiniBatches(train, builder), residual=networks)
         with RunEvents(options.curves / name.replace(" ", "_")) as events:
-            events.write_layout([], [])
             for _ in track(range(options.epochs), description=name):
                 epoch = trainer.run_epoch()
                 events.write_epoch(epoch, trainer.loss.mean_square(MiniBatches(test, builder)))

@@ -177,32 +177,6 @@ class Fork(Generic[T]):
         return self._work()
 
 
-@contextmanager
-def in_forks(items: Sequence[Item], work: Callable[[Item], T], count: int) -> Iterator[Callable[[], list[T]]]:
-    """Copies of this process that work on some items within the block, while this process does something else.
-
-    Args:
-        items: about the same work each.
-        work: a function of one; its result pickles.
-        count: of forks.
-
-    Yields:
-        What waits for them: the results in the order of the items.
-    """
-    count = min(count, len(items))
-
-    def share(first: int) -> list[T]:
-        return [work(item) for item in items[first::count]]
-
-    def results() -> list[T]:
-        shares = [fork.result() for fork in forks]
-        return [shares[number % count][number // count] for number in range(len(items))]
-
-    with ExitStack() as stack:
-        forks = [stack.enter_context(Fork(partial(share, first))) for first in range(count)]
-        yield results
-
-
 def share_between_forks(items: Sequence[Item], work: Callable[[Item], T], count: int) -> list[T]:
     """What a function makes of each of some items, in their order; this process works on some, its forks on others.
 
@@ -212,11 +186,14 @@ def share_between_forks(items: Sequence[Item], work: Callable[[Item], T], count:
         count: of processes, this one included.
     """
     count = max(min(count, len(items)), 1)
-    others = [item for number, item in enumerate(items) if number % count]
-    with in_forks(others, work, count - 1) as results:
-        own = [work(item) for item in items[::count]]
-        rest = iter(results())
-    return [next(rest) if number % count else own[number // count] for number in range(len(items))]
+
+    def share(first: int) -> list[T]:
+        return [work(item) for item in items[first::count]]
+
+    with ExitStack() as stack:
+        forks = [stack.enter_context(Fork(partial(share, first))) for first in range(1, count)]
+        shares = [share(0), *(fork.result() for fork in forks)]
+    return [shares[number % count][number // count] for number in range(len(items))]
 
 
 def share_between_processes(items: Sequence[Item], work: Callable[[Item], T], count: int) -> list[T]:

@@ -18,7 +18,6 @@ from torchid.cli import main
 from torchid.config import load_config
 from torchid.errors import ConfigError, InputError, LogError, UnknownNameError
 from torchid.parameters import PARAMETERS
-from torchid.report import identified_urdf
 
 FILE = DEMO / "quadruped.yaml"
 KNEE, SHANK = "front_left_knee", "front_left_shank_link"
@@ -71,10 +70,6 @@ def test_the_function_finds_what_the_command_writes_to_the_last_bit(
     assert without_times(document["metrics"]) == without_times(json.loads((folder / "metrics.json").read_text()))
     written = yaml.safe_load((folder / "config.yaml").read_text())
     assert {key for key, value in document["config"].items() if value != written[key]} == {"output"}
-
-
-def test_keywords_alone_find_what_the_file_finds(demo: Path, result: torchid.Identification) -> None:
-    np.testing.assert_array_equal(torchid.identify(**sections(demo)).phi, result.phi)
 
 
 def test_without_an_output_nothing_is_written(
@@ -152,19 +147,6 @@ def test_the_table_has_a_row_for_each_parameter(result: torchid.Identification) 
     assert len(str(table).splitlines()) == len(table) + 1
 
 
-@pytest.mark.filterwarnings(UNPHYSICAL)
-def test_the_urdf_is_that_of_the_run_and_replaces_nothing(
-    demo: Path, result: torchid.Identification, tmp_path: Path
-) -> None:
-    path = result.to_urdf(tmp_path / "out.urdf")
-    assert path.read_bytes() == identified_urdf(result.experiment.robot, result.phi)
-    with pytest.raises(ConfigError, match="path: exists; accepted: a new file, or overwrite=True in place of a file"):
-        result.to_urdf(path)
-    result.to_urdf(path, overwrite=True)
-    with pytest.raises(ConfigError, match="is or belongs to what is read"):
-        result.to_urdf(demo / "quadruped.urdf", overwrite=True)
-
-
 def test_a_result_and_its_folder_are_evaluated_alike(demo: Path, result: torchid.Identification, folder: Path) -> None:
     of_result = torchid.evaluate(result, demo / "sway_test.npz")
     of_folder = torchid.evaluate(folder, [demo / "sway_test.npz"])
@@ -182,12 +164,6 @@ def test_logs_are_checked_from_files_and_from_memory(demo: Path, capsys: pytest.
     (alone,) = torchid.check(demo / "sway_test.npz", robot=demo / "quadruped.urdf")
     assert len(alone.skipped) < len(torchid.check(torchid.read_log(demo / "sway_test.npz")).skipped)
     assert capsys.readouterr().out == ""
-
-
-def test_an_analysis_has_what_the_command_writes(demo: Path, tmp_path: Path) -> None:
-    analysis = torchid.analyze(demo / "quadruped.yaml", output=tmp_path / "run", estimator=FAST_ESTIMATOR)
-    written = json.loads((tmp_path / "run.analysis" / "analysis.json").read_text())
-    assert json.loads(json.dumps(analysis.to_dict())) == written
 
 
 @pytest.mark.parametrize(

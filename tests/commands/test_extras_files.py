@@ -15,7 +15,6 @@ from synthetic import Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.cli import main
-from torchid.config import load_config
 from torchid.logs import write_log
 from torchid.problem import ExtraTerms
 
@@ -134,15 +133,3 @@ def test_actuators_that_cannot_be_stand_on_their_bounds_and_are_named(
     )
     assert found["at_bound"]
     assert -found["value"] == pytest.approx(resisting, abs=1e-4)
-
-
-def test_the_width_of_the_sign_is_found(run: Run) -> None:
-    """Nobody knows it: everything else is fitted anew for each, and a run folder has the number."""
-    output = run.folder / "auto"
-    assert main(["identify", str(run.file), "actuators.sign_width=auto", f"output={output}"]) == 0
-    found = json.loads((output / "metrics.json").read_text())
-    choice = found["sign_width_selection"]
-    assert choice["width"] == pytest.approx(WIDTH, rel=2e-3)
-    assert min(choice["residual"]) < 1e-2
-    assert load_config(output / "config.yaml").actuators.sign_width == choice["width"]
-    assert errors_in(found["train"])["joint_torque"] < 1e-2 * errors_in(found["train_nominal"])["joint_torque"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +14,12 @@ from motions import value
 from plates import LABORATORIES, centres_of_pressure, plates_csv, walk, write_motion
 from raw_logs import write_arrays
 from refusals import refusal
-from repository import SHARED
 from scipy.spatial.transform import Rotation
-from simulated import BIPED, feet_of
+from simulated import BIPED
 from thinned import slow_but
 
 from torchid.cli import main
-from torchid.logs import Log, read_log, write_log
+from torchid.logs import Log, write_log
 
 MOTION = "motion.npz + plates.csv"
 
@@ -117,24 +115,6 @@ def arrays(folder: Path) -> Path:
 
     known |= {"grf": turned(force), "cop": 100.0 * turned(points - [1.0, 2.0, 3.0]), "free_moment": free[..., None]}
     return write_arrays(folder / "both.h5", known)
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded logs (../shared/data) are not here")
-@pytest.mark.parametrize("off", [0.0, 0.1])
-def test_a_plate_that_lies_elsewhere_is_noticed(off: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A person on two plates, said to be 10 cm from where they are."""
-    urdf, log = (
-        SHARED / "human_squats" / "human.urdf",
-        read_log(SHARED / "human_squats" / "squats1.npz").select(slice(0, 1000)),
-    )
-    wrench = value(log.contact_wrench_world)
-    moments = wrench[..., 3:] + np.cross(feet_of(log, urdf)[0] - [off, 0.0, 0.0], wrench[..., :3])
-    turned = np.concatenate([wrench[..., :3], moments], axis=2)
-    write_log(replace(log, contact_wrench_world=turned, moments_about_world_origin=True), tmp_path / "walk.npz")
-    main(["check", str(tmp_path / "walk.npz"), "--urdf", str(urdf)])
-    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert ("contact_wrench_world, point" in out) == bool(off)
-    assert ("check the points of" in out) == bool(off)
 
 
 def test_plates_without_a_pose_in_their_world_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 from currents import HIP_SCALE, HIPS, KNEE_SCALE, KNEES, NOISE, quadruped_files
@@ -15,11 +14,6 @@ from repository import SHARED
 from synthetic import ROBOTS
 
 from torchid.cli import main
-from torchid.estimators import LeastSquares
-from torchid.fitting.prior_knowledge import KnownMass, with_known_masses
-from torchid.identifiability.confounding import mass_weights
-from torchid.parameters import PER_BODY
-from torchid.problem import LinearProblem
 
 SCALES = dict.fromkeys(HIPS, HIP_SCALE) | dict.fromkeys(KNEES, KNEE_SCALE)
 SENSORS = {"set": "joints", "noise": NOISE, "scales": {"joint_torque": [HIPS, KNEES]}}
@@ -113,27 +107,3 @@ def test_a_recorded_robot_that_stands_on_all_feet_is_refused_with_the_reason(
     message = refusal(["identify", str(tmp_path / "go2.yaml")], tmp_path, capsys)
     assert "sensors.scales: of all measured forces, which no mass determines here: scale of *_hip_joint" in message
     assert "accepted: a sensor without a scale, or logs in which each contact lifts" in message
-
-
-def test_exact_masses_hold_whatever_the_data_say_and_uncertain_ones_are_weighed() -> None:
-    """Against the optimum with a Lagrange multiplier, and against rows of their own."""
-    rng, count = np.random.default_rng(0), 3 * PER_BODY
-    A, b = rng.normal(size=(2 * count, count)), rng.normal(size=2 * count)
-    nominal, scale = rng.uniform(0.5, 1.0, count), rng.uniform(0.5, 2.0, count)
-    free = np.ones(count, dtype=bool)
-    free[PER_BODY : 2 * PER_BODY] = False
-    problem = LinearProblem(A, b, 0.0, 2 * count, nominal, scale, free)
-    total, one = mass_weights(3), mass_weights(3) * (np.arange(count) == 0)
-    exact = KnownMass("a", total, 7.0), KnownMass("b", one, 2.5)
-    found = LeastSquares().solve(with_known_masses(problem, exact)).phi
-    E = np.array([total, one])[:, free]
-    known = np.array([7.0, 2.5]) - np.array([total, one])[:, ~free] @ nominal[~free]
-    left = b - A[:, ~free] @ nominal[~free]
-    H = np.block([[A[:, free].T @ A[:, free], E.T], [E, np.zeros((2, 2))]])
-    expected = np.linalg.solve(H, np.append(A[:, free].T @ left, known))[: free.sum()]
-    np.testing.assert_allclose(found[free], expected, rtol=1e-9)
-    assert np.array_equal(found[~free], nominal[~free])
-    uncertain = with_known_masses(problem, [KnownMass("a", total, 7.0, 0.2)], 1.5)
-    rows = np.vstack([A, 1.5 / 0.2 * total])
-    expected = np.linalg.lstsq(rows[:, free], np.append(left, 7.5 * (7.0 - total[~free] @ nominal[~free])))[0]
-    np.testing.assert_allclose(LeastSquares().solve(uncertain).phi[free], expected, rtol=1e-9)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from demo import shortened_demo
-from large import assert_same, tensors
+from large import tensors
 
 from torchid.cli import main
 from torchid.config import load_config
@@ -57,14 +57,6 @@ def test_no_filter_carries_samples_from_one_part_into_the_other(demo: Path, sett
         for name, x in tensors(part).items():
             assert torch.equal(x.nan_to_num(), tensors(file)[name].nan_to_num()), name
     assert [Path(part.source).name for part in parts] == ["sway_train.npz[:7]", "sway_train.npz[7:]"]
-
-
-def test_parts_that_are_read_block_by_block_are_the_same(demo: Path) -> None:
-    names = ["sway_train.npz[:7]", "sway_train.npz[7:]"]
-    blocks = read(demo, names, "preprocessing.memory_gb=0.0001")
-    for part, whole in zip(blocks, read(demo, names), strict=True):
-        assert part.folder is not None
-        assert_same(part, whole, 1e-9)
 
 
 def identified(demo: Path, out: Path, logs: dict[str, list[Any]], *overrides: str) -> dict[str, Any]:

@@ -21,9 +21,6 @@ from torchid.cli import main
 from torchid.commands import EXPORT_FORMATS
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
-from torchid.problem.chunks import chunks_by_state
-from torchid.problem.metrics import force_series
-from torchid.reading.log_reader import LogReader
 from torchid.report.mjcf_files import mjcf_of_urdf
 from torchid.robot import load_robot
 
@@ -105,38 +102,6 @@ def test_a_key_of_the_other_kind_is_refused(runs: dict[str, Path], tmp_path: Pat
         torchid.identify(
             DEMO / "quadruped.yaml", robot={"urdf": runs["mjcf"].parent / "quadruped.xml"}, output=tmp_path / "out"
         )
-
-
-def models(runs: dict[str, Path], folder: Path, of_joints: str) -> tuple[Path, Path]:
-    """The robot's model, and one whose joints have attributes more."""
-    bare, other = runs["mjcf"].parent / "quadruped.xml", folder / "rotors.xml"
-    other.write_text(bare.read_text().replace("<joint ", f"<joint {of_joints} "))
-    return bare, other
-
-
-def test_a_known_armature_is_taken_off_the_torques_and_a_fitted_one_is_all_of_it(
-    runs: dict[str, Path], tmp_path: Path
-) -> None:
-    bare, with_rotors = models(runs, tmp_path, 'armature="0.05" stiffness="2" springref="0.1"')
-    rows = {}
-    for name, file, fitted in (("all", bare, True), ("none", bare, False), ("known", with_rotors, False)):
-        actuators = {"armature": fitted, "stiffness": fitted, "torque_offset": fitted}
-        sections: dict[str, Any] = {"robot": {"urdf": None, "mjcf": file}, "actuators": actuators}
-        experiment = set_up(load_config(DEMO / "quadruped.yaml", (), sections | {"output": None}))
-        (samples,) = LogReader(experiment, None).read([LOG], None, lambda _: None)
-        builder, (state, index) = experiment.builder(experiment.sensors), next(iter(chunks_by_state(samples)))
-        rows[name] = builder.rows_by_sample(samples[index], state)[0].numpy()
-        series = force_series(
-            builder, samples, np.append(experiment.robot.nominal, np.zeros(len(builder.extras)))[None]
-        )
-        rows[f"predicted {name}"] = series[1][0]
-    size = rows["none"].shape[2] - 1
-    armature, offset, stiffness = (rows["all"][..., size:-1][..., k : k + 12].sum(-1) for k in (0, 12, 24))
-    expected = rows["none"][..., -1] - (0.05 * armature + 2.0 * stiffness - 0.2 * offset)
-    np.testing.assert_allclose(rows["known"][..., -1], expected, atol=1e-10 * np.abs(expected).max())
-    torque = 0.05 * samples.joint_acceleration + 2.0 * (samples.joint_position - 0.1)
-    difference = rows["predicted known"][:, 6:] - rows["predicted none"][:, 6:]
-    np.testing.assert_allclose(difference, torque.numpy(), atol=1e-10)
 
 
 def test_the_log_is_replayed_on_the_mjcf_robot_as_on_the_urdf(runs: dict[str, Path], tmp_path: Path) -> None:

@@ -89,15 +89,6 @@ def test_a_fit_that_leaves_most_of_the_forces_is_refused_whether_or_not_a_mistak
             identified(log, tmp_path)
 
 
-def test_a_refusal_names_the_band_that_a_fit_predicts(tmp_path: Path) -> None:
-    log = case_of(ARM, "contacts").log
-    noise = 1e-3 * np.random.default_rng(0).normal(size=log.joint_position.shape)
-    with pytest.raises(
-        ImplausibleFitError, match=r"preprocessing.cutoff_hz=\d.* up to 40 Hz, predicts this band worse"
-    ):
-        identified(replace(log, joint_position=log.joint_position + noise), tmp_path, cutoff_hz=40.0)
-
-
 def test_an_honest_log_is_not_suspected(tmp_path: Path) -> None:
     run = identified(case_of(ARM, "contacts").log, tmp_path)
     assert run.suspected == ""

@@ -11,7 +11,6 @@ import yaml
 from torchid.config import load_config
 from torchid.config.yaml_text import check_yaml, yaml_lines
 from torchid.errors import ConfigError
-from torchid.guards import MAX_NODES
 
 HEAD = "robot: {urdf: x.urdf}\n"
 TEXTS = {
@@ -34,34 +33,10 @@ def test_what_is_no_yaml_is_said_with_its_line(tmp_path: Path, text: str) -> Non
     assert "\\n" not in str(raised.value), "one line of plain text"
 
 
-@pytest.mark.parametrize(("entry", "size"), [("x", 1), ("[]", 1), ("[x]", 2), ("{a: [x, y]}", 5)])
-def test_entries_count_alike_whether_written_out_or_by_an_alias(entry: str, size: int) -> None:
-    """A list is an entry, and so are a key and its value."""
-    most = (MAX_NODES - 1) // size
-    for others in (entry, "*one"):
-        check_yaml(f"[&one {entry}{f', {others}' * (most - 1)}]")
-        with pytest.raises(ValueError, match=f"more than {MAX_NODES} entries, aliases unfolded"):
-            check_yaml(f"[&one {entry}{f', {others}' * most}]")
-
-
-@pytest.mark.parametrize(
-    ("value", "found"),
-    [
-        *(("!!int x", "'x', which is no !!int"), ("!!int 1.5", "'1.5', which is no !!int")),
-        *(("!!bool 1", "'1', which is no !!bool"), ("!!float on", "'on', which is no !!float")),
-        ("!!timestamp 2001-01-01", "the tag 'tag:yaml.org,2002:timestamp', which settings have no use for"),
-        *(("*b", "'*b', which stands for nothing complete"), ("&b [*b]", "'*b', which stands for nothing complete")),
-    ],
-)
-def test_a_tag_that_contradicts_its_value_and_an_alias_of_nothing_are_refused(value: str, found: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(found)):
+@pytest.mark.parametrize("value", ["!!int x", "!!timestamp 2001-01-01", "!!python/name:os.system"])
+def test_tags_are_refused(value: str) -> None:
+    with pytest.raises(ValueError, match="which settings have no use for"):
         check_yaml(f"a: {value}")
-
-
-@pytest.mark.parametrize("value", ["!!int 3", "!!float 3", "!!float .5", "!!null ~", "!!str 3", "! 3", "!!seq [1]"])
-def test_a_tag_that_says_what_its_value_is_may_stand(value: str) -> None:
-    check_yaml(f"a: {value}")
-    yaml.safe_load(f"a: {value}")
 
 
 VALUES = [

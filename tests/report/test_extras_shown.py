@@ -81,15 +81,3 @@ def test_the_figures_legend_names_every_log_whichever_panel_it_is_in() -> None:
     keys = [to_rgba(key.get_color()) for key in legend.legend_handles]
     assert drawn == [set(keys[:2]), set(keys[2:])]
     assert len(set(keys)) == 3
-
-
-def test_confounded_values_leave_room_for_those_that_are_known() -> None:
-    known = [replace(found("stiffness", f"j{k}", "", "N m/rad"), value=0.1 * k) for k in range(3)]
-    far = replace(found("stiffness", "far", "", "N m/rad"), value=-70.0, inflation=1e9, confounded_with=("m of trunk",))
-    (whole,), (cut,) = (extra_figure(extras).axes for extras in (known, [*known, far]))
-    assert not whole.texts
-    assert -1.0 < cut.get_xlim()[0] < -0.196
-    assert 0.396 < cut.get_xlim()[1] < 1.0
-    assert [text.get_text() for text in cut.texts] == ["◂ -70"]
-    assert cut.get_xlabel() == "stiffness [N m/rad]"
-    assert not cut.figure.legends, "all logs alone need no key"

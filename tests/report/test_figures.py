@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torchid.fitting.calibration import Comparison
 from torchid.problem import Metrics
 from torchid.report.figure_style import label_decades
-from torchid.report.figures import contribution_figure, error_figure
+from torchid.report.figures import error_figure
 
 
 def metrics(rms: float, noise: float | None) -> Metrics:
@@ -29,13 +29,6 @@ def test_the_noise_of_the_readings_crosses_the_bars_of_the_errors_that_it_is_par
     assert [text.get_text() for text in legend.get_texts()] == ["URDF", "identified", "noise of the readings alone"]
     (without,) = error_figure({"test": Comparison(metrics(4.0, None), metrics(1.0, None))}).axes
     assert not without.collections
-
-
-def test_a_log_that_is_alone_needs_no_bar_of_its_own() -> None:
-    groups = {"logs": [("a.npz", 9.0)], "sensors": [("hip", 1.0), ("knee", 2.0)]}
-    shown = [axis.get_title(loc="left") for axis in contribution_figure(groups).axes]
-    assert shown == ["sensors"]
-    assert len(contribution_figure({"logs": [("a.npz", 9.0)]}).axes) == 1, "unless there is nothing else"
 
 
 @pytest.mark.parametrize(("low", "high", "said"), [(0.02, 0.4, {"0.02", "0.1", "0.2"}), (1e-12, 3.0, {"10⁻⁸", "1"})])

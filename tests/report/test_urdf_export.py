@@ -197,23 +197,6 @@ def test_all_that_is_not_inertia_or_friction_stays_as_it_was(tmp_path: Path) -> 
     assert kept[0] == kept[1]
 
 
-def test_bodies_without_mass_stay_as_they_were_and_bodies_that_lose_theirs_have_none(tmp_path: Path) -> None:
-    """The human's clavicles and virtual links have no inertial at all."""
-    robot = load(ROBOTS / "human_description/robots/human.urdf")
-    assert robot.massless
-    phi = perturbed(robot)
-    path = exported(robot, phi, tmp_path)
-    assert load(path).massless == robot.massless
-    before, after = (etree.parse(str(p)).getroot() for p in (robot.path, path))
-    for name in robot.massless:
-        written, again = (root.find(f"link[@name='{name}']").findall("inertial") for root in (before, after))
-        assert [etree.tostring(element) for element in written] == [etree.tostring(element) for element in again]
-    small = robot_of("machine", tmp_path)
-    phi = perturbed(small)
-    phi[-1, parameters.INERTIAL] = 0.0
-    assert load(exported(small, phi, tmp_path)).massless == (small.body_names[-1],)
-
-
 def test_impossible_bodies_and_driving_friction_are_warned_of_by_name(tmp_path: Path) -> None:
     robot = robot_of("machine", tmp_path)
     phi = perturbed(robot)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -77,19 +76,6 @@ def test_the_worst_log_comes_first_and_what_is_worse_than_the_urdf_is_said(evalu
         "WORSE THAN URDF: the identified parameters predict worse than the URDF's, on bad: joint torque 5"
     )
     assert said.index("on bad") < said.index("on fair") < said.index("on good")
-
-
-def test_a_run_whose_model_does_not_explain_its_own_logs_says_so_of_others(run: Path, evaluated: EvaluatedRun) -> None:
-    assert evaluated.explained
-    assert "noise alone" not in evaluation_lines(evaluated, 400)[0]
-    file = run / "metrics.json"
-    document = json.loads(file.read_text())
-    try:
-        file.write_text(json.dumps(document | {"misfit": document["misfit"] | {"explained": False}}))
-        lacking = torchid.evaluate(run, LOG)
-    finally:
-        file.write_text(json.dumps(document))
-    assert evaluation_lines(lacking, 400)[0].endswith("'s; residuals of the run's own logs are not noise alone")
 
 
 def test_all_errors_are_printed_when_asked_for(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
-from demo import shortened_demo
 
-from torchid.cli import main
 from torchid.report.tables import WIDTH, terminal_width
-from torchid.terminal.lines import CUT, LINES, column_lines, labelled, wrap_words
+from torchid.terminal.lines import CUT, column_lines, labelled, wrap_words
 
 LONG = "front-left-limb-of-a-robot-whose-names-are-longer-than-a-line"
 
@@ -70,23 +66,3 @@ def test_what_is_redirected_is_as_wide_as_columns_says(
     if stated is not None:
         monkeypatch.setenv("COLUMNS", stated)
     assert terminal_width() == width
-
-
-@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-@pytest.mark.parametrize("width", [80, pytest.param(100, marks=pytest.mark.slow)])
-def test_no_line_of_a_command_is_wider_than_that(
-    width: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The answers have 20 lines at most, and `--verbose` keeps to the width likewise."""
-    demo = shortened_demo(tmp_path / "demo", 150)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", str(width))
-    (file, log), run = (str(demo / name) for name in ("quadruped.yaml", "sway_test.npz")), "output=run"
-    for words in (["identify", file, run], ["evaluate", "run", "--log", log], ["analyze", file, run], ["check", file]):
-        for verbose in ([], ["--verbose"]):
-            again = ["overwrite=true"] if words[0] in ("identify", "analyze") else []
-            assert main([*words, *again, *verbose]) == 0
-            lines = capsys.readouterr().out.splitlines()
-            assert verbose or len(lines) <= LINES
-            for line in lines:
-                assert len(line) <= width or line.startswith("written to "), "a path is not broken"

@@ -3,7 +3,7 @@
 A module for each command: `analyze`, `check` (and `convert`), `compress`, `demo`, `evaluate`, `export`, `identify`,
 `init`, `replay`, `report`, `sample`, `simulate`. What they are made of:
 
-- a fit: `prepared_data`, `chosen_settings`, `training, `plausibility`
+- a fit: `chosen_settings`, `training`, `plausibility`
 - what `identify` returns and says: `results`, `named_results`, `answer`, `run_figures`
 - parts of `init` and `analyze`: `init_logs`, `init_robot`, `sensor_set_accuracy`
 - folders: `folder`

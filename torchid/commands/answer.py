@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,15 +11,11 @@ import numpy as np
 from torchid.config.logs import tests_on_seen_samples
 from torchid.errors import format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
-from torchid.estimators.least_squares import IDENTIFIED
-from torchid.fitting.calibration import list_confounded
+from torchid.fitting.calibration import Confounded, list_confounded
 from torchid.fitting.noise import AT_THE_FLOOR, unexplained_joints
 from torchid.fitting.posterior import FittedPosterior
-from torchid.identifiability.confounding import TotalMass
 from torchid.log_checks.contacts import MAX_MASS_ERROR
-from torchid.logs.columns import values_by_name
 from torchid.logs.time_range import log_title
-from torchid.parameters import COULOMB, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import (
     ADVICE,
@@ -106,11 +102,10 @@ class ErrorComparison:
 
 _LARGER_THAN_MEASURED = 1.05  # errors over the measured, of sensors that any fit of their limb explains better
 _MUCH_MORE = 1.5  # residuals of bodies that can exist over the least: 1.001 of honest logs, 1.9 to 30 with a unit wrong
-_EXACT = 1e-3  # of what the nominal parameters leave: signals without noise, of which a solver's tolerance is left
+_EXACT_SHARE = (
+    1e-3  # of what the nominal parameters leave: signals without noise, of which a solver's tolerance is left
+)
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
-_HEAVY = 2.0  # times the mass in the robot's file
-_COMPUTED = 1e-3  # of the measured, to which no file predicts what a real robot does: friction alone is more
-_ALIKE, _DIFFERENT, _SAME_STEP = 0.2, 1.5, 0.1  # of armatures over kd, relative; of gains; of a step, relative
 _ANOTHER_ROBOT = 1.0  # of each body that data determine: no file of the same robot is off by so much
 
 
@@ -198,77 +193,58 @@ def _bodies_text(run: Identification) -> str:
 
 
 def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
-    """What the user should look at, the most urgent first."""
-    if run.worse:
-        yield ADVICE
-    if run.suspected:
-        yield f"torchid check finds in {run.suspected}"
-    if isinstance(run.estimate, SgdEstimate) and not run.estimate.converged:
-        yield _unfinished(run.estimate)
-    yield from _unlike_sensors(judged.identified)
-    yield from _computed(judged)
-    impossible = [one.term for one in run.violations if one.term is not None]
-    if impossible:
-        advice = "estimator.name=consistent finds the best that can be"
-        yield f"negative, which nothing is: {join_names(impossible)}; {advice}"
-    yield from _impossible(run)
-    yield from _driving(run)
-    yield from _unlike_joints(run)
-    yield from _heavy(run)
-    if not run.misfit.explained:
-        why = run.misfit.in_short
-        yield f"friction, compliance or contacts are missing, or a sensor is wrong (torchid check): {why}"
-    yield from _resting(run)
-    if run.experiment.config.estimator.total_mass is None and _contradicts_nominal(run.mass):
-        ratio = f"{run.mass.value / run.mass.nominal:.3g} times the {run.experiment.robot.format}'s"
-        yield f"the total mass is {ratio}: weigh the robot, or mend units and gains of forces: torchid check"
-    if not run.misfit.judged:
-        reason = "no noise is stated, and the logs are too short to tell it from errors of the model"
-        yield f"whether the model explains these forces is not known: {reason}; state sensors.noise, or record more"
-    yield from _noise_alone(run)
-    yield from _undetermined(run)
-    yield from _implicit(run)
-    for one in list_confounded([x for x in run.extras if x.extra.what not in run.choices.adopted_terms]):
-        yield one.in_short
-    yield from _far_off(run.posterior)
-    if run.noise.suggested:
-        yield f"noise: {noise_advice(run.noise.suggested)}"
+    """What the user should look at: conditions with what they mean and what to do, the most urgent first."""
+    mass, of, estimate = run.mass, run.experiment.robot.format, run.estimate
+    terms = [one.term for one in run.violations if one.term is not None]
+    least = estimate.relative_increase if isinstance(estimate, ConsistentEstimate) else None
+    growth = np.sqrt(1.0 + (least or 0.0))
+    ratio = mass.value / mass.nominal if mass.nominal else np.nan
+    is_clear = abs(mass.value - mass.nominal) > _CLEAR_ERRORS * mass.standard_error
+    is_off = abs(mass.value - mass.nominal) > MAX_MASS_ERROR * mass.nominal
+    contradicts = run.experiment.config.estimator.total_mass is None and mass.determined and is_clear and is_off
+    is_open = not mass.determined and (is_off or not run.experiment.robot.fixed_base)
+    let = f", and the fit lets it be {decimal(mass.value)} kg ({decimal(mass.nominal)} kg by the {of})" * is_off
+    independent = f"{run.samples / estimate.oversampling:.0f} independent samples"
+    rules = (
+        (bool(run.worse), ADVICE),
+        (bool(run.suspected), f"torchid check finds in {run.suspected}"),
+        *((True, text) for text in _unfinished(estimate)),
+        *((True, text) for text in _unlike_sensors(judged.identified)),
+        (bool(terms), f"negative, which nothing is: {join_names(terms)}; estimator.name=consistent finds the best "
+                      "that can be"),
+        (growth > _MUCH_MORE and (run.misfit.share or 0.0) > _EXACT_SHARE,
+         f"no bodies that can exist explain these forces: they leave {growth:.2g} times as much as bodies that cannot; "
+         "unit, gear or sign of a torque? (torchid check)"),
+        *((True, text) for text in _unlike_joints(run)),
+        (not run.misfit.explained,
+         "friction, compliance or contacts are missing, or a sensor is wrong (torchid check): "
+         f"{run.misfit.in_short}"),
+        *((True, text) for text in _resting(run)),
+        (contradicts, f"the total mass is {ratio:.3g} times the {of}'s: weigh the robot, or mend units and gains of "
+                      "forces: torchid check"),
+        (not run.misfit.judged,
+         "whether the model explains these forces is not known: no noise is stated, and the logs are too short to tell "
+         "it from errors of the model; state sensors.noise, or record more"),
+        (estimate.block_error is None,
+         f"95 % intervals count noise alone, no error of the model, which {independent} do not show: record more"),
+        (is_open, f"these data do not determine the total mass{let}; weigh the robot: estimator.total_mass"),
+        *((True, one.in_short) for one in _confounded(run)),
+        *((True, text) for text in _far_off(run.posterior)),
+        (bool(run.noise.suggested), f"noise: {noise_advice(run.noise.suggested)}"),
+    )  # fmt: skip
+    return (text for applies, text in rules if applies)
 
 
-def _implicit(run: Identification) -> Iterator[str]:
-    """That armatures are those which a simulator's implicit integration of a PD law adds, where its kd is stated."""
-    logs, robot = run.experiment.config.logs, run.experiment.robot
-    torque = logs.columns.joint_torque if logs.columns else None
-    if run.forces is None or torque is None or torque.pd is None or torque.pd.kd is None:
-        return
-    kd = values_by_name("logs.columns.joint_torque.pd.kd", torque.pd.kd.value, robot.joint_names)
-    known = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
-    found = {x.extra.name: x.value - known[x.extra.name] for x in run.extras if x.extra.what == "armature"}
-    if step := implicit_step(kd, found, float(np.median(np.diff(run.forces.time)))):
-        yield f"armatures are {1e3 * step:.2g} ms times the stated kd: no rotors, but a simulator's implicit PD law"
+def _confounded(run: Identification) -> Sequence[Confounded]:
+    return list_confounded([x for x in run.extras if x.extra.what not in run.choices.adopted_terms])
 
 
-def implicit_step(kd: Mapping[str, float], armatures: Mapping[str, float], step: float) -> float | None:
-    """The time [s] by which armatures [kg m^2] are the gains kd [N m s/rad] times it; None for a coincidence.
-
-    It is none where gains differ and armatures go with them, or where the time is the step of the samples.
-    Source: MuJoCo's integrators, (M + h kd) a = f for a damping of kd and a step of h.
-    """
-    gains = np.array([gain for name, gain in kd.items() if gain > 0.0 and name in armatures])
-    if not len(gains):
-        return None
-    times = np.array([armatures[name] / gain for name, gain in kd.items() if gain > 0.0 and name in armatures])
-    common = float(np.median(times))
-    alike = common > 0.0 and bool((np.abs(times / common - 1.0) < _ALIKE).all())
-    known = gains.max() > _DIFFERENT * gains.min() or abs(common / step - 1.0) < _SAME_STEP
-    return common if alike and known else None
-
-
-def _noise_alone(run: Identification) -> Iterator[str]:
-    """That nothing but noise is in the intervals, as there are too few blocks to scatter."""
-    if run.estimate.block_error is None:
-        count = f"{run.samples / run.estimate.oversampling:.0f} independent samples"
-        yield f"95 % intervals count noise alone, no error of the model, which {count} do not show: record more"
+def _unfinished(estimate: Estimate) -> Iterator[str]:
+    """How far above the least objective under the same conditions a descent ended."""
+    if isinstance(estimate, SgdEstimate) and not estimate.converged:
+        share = "an unknown" if estimate.excess is None else f"{100.0 * estimate.excess:.2g}"
+        advice = "more estimator.training.epochs, or estimator.name=consistent"
+        yield f"not converged: {share} % above the optimum; {advice}"
 
 
 def _resting(run: Identification) -> Iterator[str]:
@@ -284,55 +260,6 @@ def _resting(run: Identification) -> Iterator[str]:
         yield f"actuators.stiction=true, as joints rest ({names}): {why}"
 
 
-def _undetermined(run: Identification) -> Iterator[str]:
-    """That data do not determine the total mass of a robot, which a weak prior may leave far from the nominal."""
-    away = abs(run.mass.value - run.mass.nominal) > MAX_MASS_ERROR * run.mass.nominal
-    if run.mass.determined or not (away or not run.experiment.robot.fixed_base):
-        return
-    what = "these data do not determine the total mass"
-    if away:
-        nominal = f"{decimal(run.mass.nominal)} kg by the {run.experiment.robot.format}"
-        what += f", and the fit lets it be {decimal(run.mass.value)} kg ({nominal})"
-    yield f"{what}; weigh the robot: estimator.total_mass"
-
-
-def _heavy(run: Identification) -> Iterator[str]:
-    """Bodies beyond `_HEAVY` times their mass in the robot's file, which their own interval does not exclude."""
-    robot, estimate = run.experiment.robot, run.estimate
-    mass, error = (x.reshape(-1, PER_BODY)[:, 0] for x in (estimate.phi, estimate.standard_error))
-    nominal = robot.nominal[:, 0]
-    known = (estimate.verdict.reshape(-1, PER_BODY)[:, 0] == IDENTIFIED) & (mass - nominal > 2.0 * error)
-    heavy = np.flatnonzero((mass > _HEAVY * nominal) & (nominal > 0.0) & ~known)
-    ratio = mass[heavy] / nominal[heavy]
-    if named := [f"{robot.body_names[heavy[k]]} {ratio[k]:.2g} times" for k in np.argsort(-ratio)]:
-        why = f"which the data do not determine: an estimator.ridge above {run.experiment.config.estimator.ridge}"
-        yield f"{join_names(named, _FEW_NAMED)} the {robot.format}'s mass, {why}"
-
-
-def _impossible(run: Identification) -> Iterator[str]:
-    """That the conditions, under which bodies can exist, leave much more than the fit without them."""
-    increase = run.estimate.relative_increase if isinstance(run.estimate, ConsistentEstimate) else None
-    growth = np.sqrt(1.0 + (increase or 0.0))
-    if growth > _MUCH_MORE and (run.misfit.share or 0.0) > _EXACT:
-        left = f"they leave {growth:.2g} times as much as bodies that cannot"
-        yield f"no bodies that can exist explain these forces: {left}; unit, gear or sign of a torque? (torchid check)"
-
-
-def _driving(run: Identification) -> Iterator[str]:
-    """That Coulomb friction is negative far beyond its standard errors, which least squares lets it be."""
-    found, error = (x.reshape(-1, PER_BODY)[:, COULOMB] for x in (run.estimate.phi, run.estimate.standard_error))
-    bodies = np.array(run.experiment.robot.bodies, object)[found < -_CLEAR_ERRORS * error]
-    if len(bodies) and (run.misfit.share or 0.0) > _EXACT:
-        names = join_names([body.joint.name for body in bodies], _FEW_NAMED)
-        yield f"friction drives {names}: its torque is reversed, or its friction of another shape: torchid check"
-
-
-def _unfinished(estimate: SgdEstimate) -> str:
-    """How far above the least objective under the same conditions a descent ended."""
-    share = "an unknown" if estimate.excess is None else f"{100.0 * estimate.excess:.2g}"
-    return f"not converged: {share} % above the optimum; more estimator.training.epochs, or estimator.name=consistent"
-
-
 def _unlike_sensors(identified: Metrics) -> Iterator[str]:
     """Readings that the identified parameters explain worse than no bodies, or a constant base force, would."""
     for group in (*LIMB_GROUPS, "nullspace"):
@@ -346,14 +273,6 @@ def _unlike_sensors(identified: Metrics) -> Iterator[str]:
     if share is not None and share > _LARGER_THAN_MEASURED and (of_weight or 0.0) > MAX_MASS_ERROR:
         ratio = f"base force: errors of {share:.2g} times what its measurements vary by"
         yield f"{ratio}; check frames, signs and units of contact forces and of the base's pose: torchid check"
-
-
-def _computed(judged: ErrorComparison) -> Iterator[str]:
-    """That the robot's file itself predicts the forces better than any file predicts those of a real robot."""
-    shares = [share for group in ERROR_GROUPS if (share := judged.nominal.relative_of(group)) is not None]
-    if shares and max(shares) < _COMPUTED:
-        to = f"to {format_percent(max(shares))} %"
-        yield f"the {judged.of} predicts these forces {to}: were they computed from it, or commanded, not measured?"
 
 
 def _unlike_joints(run: Identification) -> Iterator[str]:
@@ -376,9 +295,3 @@ def _far_off(fitted: FittedPosterior) -> Iterator[str]:
             causes.append(f"it has rods or plates ({join_names(thin)})")
         why = f": {', '.join(causes[:-1])}, or {causes[-1]}" if nominal.value > _ANOTHER_ROBOT else ""
         yield f"{nominal}{why}; other bodies may be as far off: torchid sample --prior-error auto"
-
-
-def _contradicts_nominal(mass: TotalMass) -> bool:
-    """Whether the data determine another mass than the model's, beyond what its bodies may be off by together."""
-    clear = abs(mass.value - mass.nominal) > _CLEAR_ERRORS * mass.standard_error
-    return mass.determined and clear and abs(mass.value / mass.nominal - 1.0) > MAX_MASS_ERROR

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -165,11 +164,14 @@ def _with_chosen_terms(setup: S, choices: Choices, trials: _Trials, bars: Progre
         adopted = choices.terms.adopted
         setup = _with_actuators(setup, **{name: name in adopted for name in candidates if name != "delay"})
         if "delay" in adopted:
-            choices.delay = _chosen("delay of torques", partial(_delay, setup, trials), bars)
+            choices.delay = _chosen("delay of torques", lambda: choose_delay(*trials.whole(setup), setup.terms), bars)
     if setup.config.actuators.delay == AUTO:
         setup = _with_actuators(setup, delay=choices.delay.delay if choices.delay else 0.0)
     if setup.config.actuators.stribeck == AUTO:
-        choices.stribeck = _chosen("Stribeck velocity", partial(_stribeck, setup, trials), bars)
+        trial = partial(trials.whole, setup)
+        choices.stribeck = _chosen(
+            "Stribeck velocity", lambda: choose_stribeck(lambda v: trial(stribeck=v), setup.terms), bars
+        )
         setup = _with_actuators(setup, stribeck=choices.stribeck.velocity)
     return setup
 
@@ -311,17 +313,6 @@ def needs_these_torques(setup: RobotSetup) -> bool:
     return is_near_nominal(gain)
 
 
-def lower_cutoff(setup: RobotSetup) -> CutoffChoice | None:
-    """The band that a fit predicts, None where it is not narrower than the one that is fitted, or not known."""
-    files, cutoff = setup.config.logs, setup.config.preprocessing.filter_hz
-    if files is None or files.compressed or cutoff is None:
-        return None
-    with suppress(InputError):
-        found = _cutoff(setup, _Trials(), CutoffChoice(cutoff, by_noise=False), _cutoff_of_motion(setup)[1])
-        return None if found.limit_hz is None else found
-    return None
-
-
 def is_near_nominal(gain: float | None) -> bool:
     """Whether a factor of forces, None for none that is clear, is one of another mass, gear or current: up to three."""
     return gain is not None and 1.0 / _LARGEST_GAIN < gain < _LARGEST_GAIN
@@ -454,14 +445,6 @@ def _cutoff_of_motion(setup: RobotSetup) -> tuple[CutoffChoice, float]:
     shortest = min(float(log.time[-1] - log.time[0]) for log in logs)
     logs = [new_poses(log) for log in logs]  # whose rate bounds the band, not that of a file which repeats them
     return choose_cutoff(logs, stated, rate, base_is_derived=from_feet), shortest
-
-
-def _delay(setup: RobotSetup, trials: _Trials) -> DelayChoice:
-    return choose_delay(*trials.whole(setup), setup.terms)
-
-
-def _stribeck(setup: RobotSetup, trials: _Trials) -> StribeckChoice:
-    return choose_stribeck(lambda velocity: trials.whole(setup, stribeck=velocity), setup.terms)
 
 
 def _with_preprocessing(setup: S, **stated: Any) -> S:

@@ -1,47 +1,56 @@
-"""`torchid identify`: from an experiment to an identification, and to a run folder."""
+"""`torchid identify`: from an experiment to an identification, and to a run folder, step by step."""
 
 from __future__ import annotations
 
+import time
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from rich.progress import Progress
 
 from torchid import distributed
-from torchid.commands.chosen_settings import with_sample_rates
+from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge, with_sample_rates
 from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible, suspected_mistake
-from torchid.commands.prepared_data import PreparedData, Stopwatch, prepare
 from torchid.commands.results import Identification, write_run
-from torchid.commands.run_figures import Drawing, drawing, figures_left, fit_figures
-from torchid.commands.training import Training, require_trainable, training_folder
+from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import ConfigError, NumericalWarning, warn_about_file
-from torchid.estimators import Conditions, Estimate, Violation, violations
+from torchid.estimators import Estimate, violations
 from torchid.estimators.conditions import term_violations
-from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_masked
-from torchid.fitting.cross_validation import CrossValidation, Scorer, calibrations_without_folds
-from torchid.fitting.factor_files import FactorFile
+from torchid.fitting.calibration import Comparison, warn_of_confounded, warn_of_masked
+from torchid.fitting.cross_validation import Scorer, calibrations_without_folds
+from torchid.fitting.experiment import Experiment, set_up, with_noise, with_task_weights
+from torchid.fitting.factor_files import FactorFile, read_fleet
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.left_out import gain_deviations
-from torchid.fitting.noise import misfit, resting_joints, unfitted_friction
+from torchid.fitting.noise import NoiseSummary, misfit, resting_joints, unfitted_friction
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
-from torchid.identifiability.confounding import LEAST_BLOCKS, TotalMass, mass_weights
-from torchid.identifiability.information import Contributions, contributions
+from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
+from torchid.identifiability.confounding import LEAST_BLOCKS, mass_weights
+from torchid.identifiability.information import contributions
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array
-from torchid.problem import Evaluation, LinearProblem, Metrics, Samples
-from torchid.problem.compression import BY_FOLD, Block, Part, merge
+from torchid.problem import Metrics, RowBuilder, Samples
+from torchid.problem.compression import (
+    BY_FOLD,
+    Block,
+    Part,
+    compress_in_blocks,
+    fold_compressed,
+    merge,
+    split_into_folds,
+)
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
 from torchid.problem.motion import is_at_rest
-from torchid.report.forces import ForceSeries
+from torchid.reading.log_reader import LogReader, check_read
 from torchid.report.tables import progress_bars
 
 
@@ -58,7 +67,8 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
         BaseLostError: the sensors cannot see the base.
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
-    trains, output = config.estimator.name == "sgd", config.output
+    output = config.output
+    trains = config.estimator.name == "sgd"
     resume = resume or (trains and output is not None and distributed.is_restart())
     with ExitStack() as stack:
 
@@ -71,136 +81,237 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
 
         distributed.from_first(claim, "output")
         bars = stack.enter_context(progress_bars())
-        run, training, begun = _identify(config, resume, bars, stack)
+        run, training = _identify(config, resume, bars)
         if output is not None:
             bars.add_task("writing", total=None)
-            begun.append(stack.enter_context(drawing(figures_left(run, begun), config)))
-            distributed.from_first(partial(write_run, run, output, config.overwrite, training, begun), "run folder")
+            distributed.from_first(partial(write_run, run, output, config.overwrite, training), "run folder")
     return run
 
 
-@dataclass(frozen=True)
-class _Solved:
-    """A fit, how outliers were down-weighted and how it was trained, if so, and the total mass."""
-
-    fit: Fit
-    robust: RobustSummary | None
-    training: Training | None
-    mass: TotalMass
-
-
-def _solved(
-    ready: PreparedData, evaluation: Evaluation, checked: TrainingLogs, bars: Progress, resume: bool
-) -> _Solved:
-    """The fit of prepared data, which may be that of a robot."""
-    experiment, fitter, logs = ready.experiment, ready.fitter, ready.logs
-    training, solve = None, None
-    if experiment.config.estimator.name == "sgd":
-        require_plausible(fitter.fit(ready.parts), checked)
-        training = Training(experiment)
-
-        def evaluate(phi: Array) -> dict[str, Metrics]:
-            return {name: evaluation.metrics(logs[name], phi[None])[0] for name in LOG_SETS if logs[name]}
-
-        solve = partial(
-            training.run, ready.parts, fitter=fitter, logs=logs, evaluate=evaluate, bars=bars, resume=resume
-        )
-    fit = fitter.fit(ready.parts, solve)
-    fit, robust = _robust(fit, ready, bars)
-    terms, gain = experiment.terms, experiment.config.sensors.gain_error
-    gains = distributed.from_first(partial(gain_deviations, logs["train"], fitter, terms, gain), "gains")
-    fit = replace(fit, estimate=replace(fit.estimate, gain_error=np.linalg.norm(gains, axis=0)))
-    of_mass = float(np.linalg.norm(gains @ mass_weights(len(experiment.robot.bodies))))
-    mass = require_plausible(fit, checked, logs["train"], of_mass)
-    warn_of_confounded([one for one in fit.extras if one.extra.what not in ready.choices.adopted_terms])
-    warn_of_masked(fit.parts, fitter.builder)
-    if experiment.sensors.task_weights is not None and fit.jackknife is None:  # the only errors that know of weights
-        found = f"set, of logs of fewer than {LEAST_BLOCKS} blocks, whose scatter intervals come from"
-        raise ConfigError.at_field("estimator.task_weights", found, "longer logs, or no such key")
-    return _Solved(fit, robust, training, mass)
-
-
-def _identify(
-    config: ExperimentConfig, resume: bool, bars: Progress, stack: ExitStack
-) -> tuple[Identification, Training | None, list[Drawing]]:
-    """What the logs say, how it was trained, if so, and figures of it that are drawn until the stack is left."""
+def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[Identification, Training | None]:
+    """What the logs say, and how it was trained, if so."""
     clock = Stopwatch()
-    ready = prepare(config, clock, bars)
-    experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
-    checked, builder = TrainingLogs(experiment, bars), fitter.builder
-    evaluation = experiment.evaluation(experiment.noise_of_readings)
+    with clock("read"):
+        experiment = set_up(config)
+        conditions = experiment.conditions()
+        training = None
+        if config.estimator.name == "sgd":
+            descent_settings(config)  # before any work
+    data = (_data_of_factors if config.logs.compressed else _data_of_logs)(experiment, clock, bars)
+    with clock("ridge"):
+        experiment, ridge = with_ridge(data.experiment, data.parts, data.blocks, data.builder, conditions, bars)
+    logs, builder = data.logs, data.builder
+    fitter = experiment.fitter(builder, conditions)
+    checked, evaluation = TrainingLogs(experiment, bars), experiment.evaluation(experiment.noise_of_readings)
+
     with clock("solve"):
-        solved = _solved(ready, evaluation, checked, bars, resume)
-        fit, ready.parts = solved.fit, []
+        solve = None
+        if config.estimator.name == "sgd":
+            require_plausible(fitter.fit(data.parts), checked)
+            training = Training(experiment)
+
+            def errors(phi: Array) -> dict[str, Metrics]:
+                return {name: evaluation.metrics(logs[name], phi[None])[0] for name in LOG_SETS if logs[name]}
+
+            solve = partial(training.run, data.parts, fitter=fitter, logs=logs, evaluate=errors, bars=bars,
+                            resume=resume)  # fmt: skip
+        fit, robust = _robust(fitter.fit(data.parts, solve), data, fitter, bars)
+        gains = distributed.from_first(
+            partial(gain_deviations, logs["train"], fitter, experiment.terms, config.sensors.gain_error), "gains"
+        )
+        fit = replace(fit, estimate=replace(fit.estimate, gain_error=np.linalg.norm(gains, axis=0)))
+        gain_error = float(np.linalg.norm(gains @ mass_weights(len(experiment.robot.bodies))))
+        mass = require_plausible(fit, checked, logs["train"], gain_error)
+        warn_of_confounded([x for x in fit.extras if x.extra.what not in data.choices.adopted_terms])
+        warn_of_masked(fit.parts, builder)
+        if experiment.sensors.task_weights is not None and fit.jackknife is None:  # its errors alone know of weights
+            found = f"set, of logs of fewer than {LEAST_BLOCKS} blocks, whose scatter intervals come from"
+            raise ConfigError.at_field("estimator.task_weights", found, "longer logs, or no such key")
+        data.parts = []
         problem, compared = fit.assembly.problem, experiment.calibrations(fit, builder)
         shown = [*logs["test"], *logs["train"]][:1]
         forces = distributed.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
-        begun = _begin_figures(ready, fit, forces, stack)
+
     with clock("identifiability"):
-        whole = merge(_with_states(fit.parts, ready.factors), builder, "source", "state", "unloaded")
-        alone = _by_state(fitter, whole)
-        added = distributed.from_first(partial(_contributions, ready, whole, problem, bars), "contributions")
+        parts = fit.parts
+        if data.factors:  # by contact state
+            parts = [*(part for x in data.factors for part in x.log.by_state), *(x for x in parts if x.unloaded)]
+        whole = merge(parts, builder, "source", "state", "unloaded")
+        by_state = _by_state(fitter, whole)
+        leaving_out = bars.add_task("leaving out each in turn", total=None)
+        names, tolerance = experiment.robot.dof_names, config.estimator.rank_tolerance
+        done = partial(bars.advance, leaving_out)
+        added = distributed.from_first(
+            lambda: contributions(whole, logs["train"], builder, problem, names, tolerance, done), "contributions"
+        )
+        bars.update(leaving_out, total=1, completed=1)
+
     with clock("evaluate"):
         without_folds = calibrations_without_folds(fit, fitter)
-        scorer, of_blocks = Scorer(evaluation, builder), merge(fit.parts, builder, *BY_FOLD)
-        scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
+        scorer = Scorer(evaluation, builder)
+        unseen = sum(map(len, logs["test"]))
+        task = bars.add_task("evaluating", total=scorer.scored(data.blocks)[1] + unseen)
+        done = partial(bars.advance, task)
+        train = scorer.score_training(data.blocks, merge(fit.parts, builder, *BY_FOLD), compared, without_folds, done)
+        metrics: dict[str, Comparison[Metrics]] = {"train": train.metrics}
+        evaluated = {"train": train.samples}
+        if logs["test"]:
+            metrics["test"] = scorer.score_logs(logs["test"], compared, done)
+            evaluated["test"] = unseen
         traces = distributed.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
         friction = unfitted_friction(problem, experiment.robot)
-        left = misfit(fit.estimate, ready.noise, blocks, fit.jackknife, friction)
+
+    phi, scale = (x.reshape(-1, PER_BODY) for x in (fit.estimate.phi, problem.scale))
     run = Identification(
         experiment=experiment,
         estimate=fit.estimate,
         extras=fit.extras,
-        noise=ready.noise,
+        noise=data.noise,
         motion_noise=fit.assembly.noise,
-        misfit=left,
+        misfit=misfit(fit.estimate, data.noise, data.blocks, fit.jackknife, friction),
         resting=resting_joints(problem, experiment.robot, builder, logs["train"]),
         at_rest=[name for name in LOG_SETS if is_at_rest(logs[name])],
-        robust=solved.robust,
-        states=ready.states,
-        by_state=alone,
+        robust=robust,
+        states=data.states,
+        by_state=by_state,
         contributions=added,
-        metrics=scores.metrics,
-        evaluated=scores.samples,
-        violations=_violations(fit.estimate, problem, ready.conditions),
+        metrics=metrics,
+        evaluated=evaluated,
+        violations=[
+            *violations(phi, scale, conditions),
+            *term_violations(problem, fit.estimate.phi, fit.estimate.psi),
+        ],
         seconds=clock.seconds,
-        samples=sum(map(len, blocks)),
-        factors=ready.factors,
-        excluded=ready.excluded,
-        mass=solved.mass,
-        posterior=fitted_posterior(fit, experiment.robot, ready.conditions),
-        validation=scores.validation,
-        ridge=ready.ridge,
-        choices=with_sample_rates(ready.choices, experiment, logs["train"]),
+        samples=sum(map(len, data.blocks)),
+        factors=data.factors,
+        excluded=data.excluded,
+        mass=mass,
+        posterior=fitted_posterior(fit, experiment.robot, conditions),
+        validation=train.cross_validation,
+        ridge=ridge,
+        choices=with_sample_rates(data.choices, experiment, logs["train"]),
         forces=next(iter(forces), None),
         traces=next(iter(traces), None),
     )
     logs.clear()  # checks of a log and figures need room, too
-    ready.blocks = blocks = []
+    data.blocks = []
     require_not_worse(run.worse, run.metrics["train"].identified, experiment.sensors, checked)
-    return replace(run, suspected=suspected_mistake(run, checked)), solved.training, begun
+    return replace(run, suspected=suspected_mistake(run, checked)), training
 
 
-def _begin_figures(ready: PreparedData, fit: Fit, forces: Sequence[ForceSeries], stack: ExitStack) -> list[Drawing]:
-    """Figures of a fit that one process, if it writes a run, draws beside what follows, until the stack is left."""
-    experiment = ready.experiment
-    if experiment.config.output is None or distributed.world_size() > 1:  # several processes draw all of them at last
-        return []
-    figures = fit_figures(experiment.robot, fit.estimate, fit.extras, ready.ridge, *forces)
-    return [stack.enter_context(drawing(figures, experiment.config))]
+# ------------------------------------------------------------------------------------------------------- what is fitted
 
 
-def _robust(fit: Fit, ready: PreparedData, bars: Progress) -> tuple[Fit, RobustSummary | None]:
+@dataclass
+class Stopwatch:
+    """Adds up seconds by step: `with clock("read"): ...`."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Add what the block takes to a step."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+@dataclass
+class TrainingData:
+    """Training logs in folds, or factors of them, with the noise of their weights, and compressed; test logs.
+
+    `experiment`: with that noise, and what the logs have chosen. `factors`: files that the training logs come from, if
+    they do.
+    """
+
+    experiment: Experiment
+    logs: dict[str, list[Samples]]
+    factors: list[FactorFile]
+    excluded: Mapping[str, int]
+    states: list[StateReport]
+    noise: NoiseSummary
+    builder: RowBuilder
+    blocks: Sequence[Block]
+    parts: list[Part]
+    choices: Choices
+
+
+def _data_of_logs(experiment: Experiment, clock: Stopwatch, bars: Progress) -> TrainingData:
+    """The logs of an experiment, read and compressed, with its settings chosen."""
+    with clock("settings"):
+        experiment, choices = with_chosen_settings(experiment, bars)
+    with clock("read"):
+        logs, excluded = _read(experiment, bars)
+    with clock("noise"):
+        states = state_reports(logs["train"], experiment.builder(experiment.sensors))
+        require_base(states, experiment.config.sensors.on_base_lost, experiment.contacts)
+        noise = distributed.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
+        experiment = with_task_weights(with_noise(experiment, noise), logs["train"])
+    with clock("compress"):
+        builder = experiment.builder(experiment.sensors)
+        blocks = split_into_folds(logs["train"], builder)
+        streaming = bars.add_task("streaming samples", total=sum(map(len, logs["train"])))
+        parts = compress_in_blocks(blocks, builder, progress=partial(bars.advance, streaming))
+    return TrainingData(experiment, logs, [], excluded, states, noise, builder, blocks, parts, choices)
+
+
+def _data_of_factors(experiment: Experiment, clock: Stopwatch, bars: Progress) -> TrainingData:
+    """The logs of an experiment that fits factors of logs."""
+    with clock("read"):
+        reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
+        fleet = read_fleet(experiment, lambda _: bars.advance(reading))
+        require_base(fleet.states, experiment.config.sensors.on_base_lost, experiment.contacts)
+        logs, _ = _read(fleet.experiment, bars)
+    with clock("compress"):
+        builder = fleet.experiment.builder(fleet.experiment.sensors)
+        blocks = fold_compressed([x.log for x in fleet.files], builder)
+        parts = [part for block in blocks for part in block.parts]
+    return TrainingData(
+        experiment=fleet.experiment,
+        logs=logs,
+        factors=fleet.files,
+        excluded={x.log.source: x.excluded for x in fleet.files if x.excluded},
+        states=fleet.states,
+        noise=fleet.noise,
+        builder=builder,
+        blocks=blocks,
+        parts=parts,
+        choices=Choices(),
+    )
+
+
+def _read(experiment: Experiment, bars: Progress) -> tuple[dict[str, list[Samples]], dict[str, int]]:
+    """Logs by use but for those of which there are factors, and how many samples of each were left out as rejected.
+
+    Those that are trained on, or decide when to stop, have every sensor of the set.
+    """
+    reader, settings = LogReader(experiment), experiment.config.logs
+    files = {name: getattr(settings, name) for name in ("train", "validation", "test")}
+    if settings.compressed:
+        files["train"] = []
+    reading = bars.add_task("reading logs", total=sum(map(len, files.values())))
+    logs = {
+        name: reader.read(paths, None if name == "test" else experiment.sensors, lambda _: bars.advance(reading))
+        for name, paths in files.items()
+    }
+    check_read(logs)
+    return logs, reader.excluded
+
+
+# -------------------------------------------------------------------------------------------------------------- the fit
+
+
+def _robust(fit: Fit, data: TrainingData, fitter: LogFitter, bars: Progress) -> tuple[Fit, RobustSummary | None]:
     """The fit with outliers down-weighted, if the settings say so; only batch estimators can.
 
     Warns:
         NumericalWarning: the passes were too few.
     """
-    loss, train = ready.experiment.loss, [x for x in ready.blocks if isinstance(x, Samples)]
+    loss, train = data.experiment.loss, [x for x in data.blocks if isinstance(x, Samples)]
     if loss is None:
         return fit, None
     bar = bars.add_task("weighing outliers down", total=loss.passes * sum(map(len, train)))
-    robust = fit_robustly(train, ready.fitter, loss, first=fit, parts=ready.parts, progress=partial(bars.advance, bar))
+    robust = fit_robustly(train, fitter, loss, first=fit, parts=data.parts, progress=partial(bars.advance, bar))
     bars.update(bar, total=1, completed=1)
     if not robust.summary.converged:
         message = f"estimator.robust: not converged after {robust.summary.passes} passes; accepted: more passes"
@@ -208,62 +319,13 @@ def _robust(fit: Fit, ready: PreparedData, bars: Progress) -> tuple[Fit, RobustS
     return robust.fit, robust.summary
 
 
-def _with_states(parts: Sequence[Part], factors: Sequence[FactorFile]) -> Sequence[Part]:
-    """The parts of a fit, by contact state where they come from factors, too."""
-    if not factors:
-        return parts
-    return [*(part for one in factors for part in one.log.by_state), *(part for part in parts if part.unloaded)]
-
-
 def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
     """What each contact state determines on its own, by least squares, most frequent first."""
     samples = Counter[ContactState]()
     for part in parts:
         samples[part.state] += part.samples
-    by_state = {state: [part for part in parts if part.state == state] for state, _ in samples.most_common()}
-    problems = {state_name(fitter.builder.contacts, x): fitter.assemble(own).problem for x, own in by_state.items()}
-    return {name: fitter.least_squares.solve(problem) for name, problem in problems.items()}
-
-
-def _contributions(ready: PreparedData, parts: Sequence[Part], problem: LinearProblem, bars: Progress) -> Contributions:
-    """What each log, contact state and sensor adds."""
-    leaving_out = bars.add_task("leaving out each in turn", total=None)
-    tolerance, names = ready.experiment.config.estimator.rank_tolerance, ready.experiment.robot.dof_names
-    done, builder = partial(bars.advance, leaving_out), ready.fitter.builder
-    out = contributions(parts, ready.logs["train"], builder, problem, names, tolerance, done)
-    bars.update(leaving_out, total=1, completed=1)
+    out = {}
+    for state, _ in samples.most_common():
+        problem = fitter.assemble([part for part in parts if part.state == state]).problem
+        out[state_name(fitter.builder.contacts, state)] = fitter.least_squares.solve(problem)
     return out
-
-
-def _violations(estimate: Estimate, problem: LinearProblem, conditions: Conditions) -> list[Violation]:
-    phi, scale = (x.reshape(-1, PER_BODY) for x in (estimate.phi, problem.scale))
-    return [*violations(phi, scale, conditions), *term_violations(problem, estimate.phi, estimate.psi)]
-
-
-@dataclass
-class _Scores:
-    """Metrics and number of evaluated samples by set of logs, and of fits without a fold each on that fold."""
-
-    metrics: dict[str, Comparison[Metrics]]
-    samples: dict[str, int]
-    validation: CrossValidation | None
-
-
-def _scores(
-    scorer: Scorer,
-    test: Sequence[Samples],
-    blocks: Sequence[Block],
-    parts: Sequence[Part],
-    compared: Comparison[Calibration],
-    without_folds: Sequence[Comparison[Calibration]],
-    bars: Progress,
-) -> _Scores:
-    """Metrics of the training logs, whose blocks the `parts` are of, and of the test logs."""
-    unseen = sum(map(len, test))
-    done = partial(bars.advance, bars.add_task("evaluating", total=scorer.scored(blocks)[1] + unseen))
-    train = scorer.score_training(blocks, parts, compared, without_folds, done)
-    scores = _Scores({"train": train.metrics}, {"train": train.samples}, train.cross_validation)
-    if test:
-        scores.metrics["test"] = scorer.score_logs(test, compared, done)
-        scores.samples["test"] = unseen
-    return scores

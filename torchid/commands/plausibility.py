@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property, partial
-from itertools import islice
+from functools import cached_property
 
 import numpy as np
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from torchid import parameters
 from torchid.commands.check import LogSegment, segments_to_check
-from torchid.commands.chosen_settings import is_near_nominal, lower_cutoff, needs_these_torques
+from torchid.commands.chosen_settings import is_near_nominal, needs_these_torques
 from torchid.commands.results import Identification
 from torchid.config import ExperimentConfig
 from torchid.config.logs import LogsConfig
@@ -41,7 +40,6 @@ from torchid.log_checks.check import check
 from torchid.log_checks.findings import SEVERITIES
 from torchid.log_checks.lags import check_tilt
 from torchid.log_checks.model import NominalModel
-from torchid.parallel import can_fork, share_between_forks, thread_count
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, Samples
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse
@@ -79,11 +77,10 @@ class TrainingLogs:
         files = self.setup.config.logs
         if files is None or files.compressed:
             return None
-        total = 100.0 * len(files.train)
-        task = self._bars.add_task("checking the logs", total=total)
-        found = list(self._findings(files, partial(self._bars.advance, task)))
-        self._bars.update(task, completed=total)
-        return min(found, key=lambda pair: _order(pair[1]), default=None)
+        task = self._bars.add_task("checking the logs", total=len(files.train))
+        findings = list(self._findings(files, task))
+        self._bars.update(task, completed=len(files.train))
+        return min(findings, key=lambda pair: _order(pair[1]), default=None)
 
     def doubt(self, reason: str, refused: bool) -> str:
         """Refuse a fit, for a reason in any case or where a log cannot be used; else what the checks find, in words.
@@ -91,40 +88,33 @@ class TrainingLogs:
         Raises:
             ImplausibleFitError: names the reason, and the mistake that the checks find.
         """
-        log, one = self.finding or ("", None)
-        found = "" if one is None else f"; torchid check finds in {log}: {one.field}: {one.found}"
-        if refused or (one is not None and one.rejects_all):
-            accepted = self._usual() if one is None else one.advice
-            raise ImplausibleFitError.at_field("logs", f"{reason}{found}", _advice(accepted, self.setup))
-        return found if one is None else f"{found}; {one.advice}"
+        if self.finding is None:
+            if refused:
+                of = self.setup.robot.format
+                accepted = f"data and {of} that fit each other; usual reasons: {_USUAL.format(of=of)}"
+                raise ImplausibleFitError.at_field("logs", reason, _advice(accepted, self.setup))
+            return ""
+        log, finding = self.finding
+        text = f"; torchid check finds in {log}: {finding.field}: {finding.found}"
+        if refused or finding.rejects_all:
+            raise ImplausibleFitError.at_field("logs", f"{reason}{text}", _advice(finding.advice, self.setup))
+        return f"{text}; {finding.advice}"
 
-    def _usual(self) -> str:
-        """What to look for where no mistake is found, with a narrower band that the model predicts, if there is one."""
-        of, lower = self.setup.robot.format, lower_cutoff(self.setup)
-        named = "" if lower is None else f"preprocessing.cutoff_hz={lower}; or "
-        return f"{named}data and {of} that fit each other; usual reasons: {_USUAL.format(of=of)}"
-
-    def _findings(self, files: LogsConfig, done: Callable[[float], None]) -> Iterator[tuple[str, Finding]]:
-        """Findings on large parts of segments; `done` is called with the share of each in its log in percent."""
-        segments, count = self._segments(files), thread_count() if can_fork() else 1
-        while together := list(islice(segments, count)):  # as many as are in memory at a time
-            findings = share_between_forks(together, _large_findings, count)
-            for (_, segment), found in zip(together, findings, strict=True):
-                yield from ((segment.name, one) for one in found)
-                if any(one.rejects_all for one in found):
-                    return
-                done(100.0 * len(segment.log) / segment.of)
-
-    def _segments(self, files: LogsConfig) -> Iterator[tuple[RobotSetup, LogSegment]]:
+    def _findings(self, files: LogsConfig, task: TaskID) -> Iterator[tuple[str, Finding]]:
+        """Findings on large parts of segments."""
         for path in files.train:
             with suppress(InputError):  # larger than memory
-                own = setup_of_log(self.setup, path)
-                yield from ((own, one) for one in segments_to_check(path, files, own.config.preprocessing))
+                setup = setup_of_log(self.setup, path)
+                for segment in segments_to_check(path, files, setup.config.preprocessing):
+                    findings = _large_findings(setup, segment)
+                    yield from ((segment.name, finding) for finding in findings)
+                    if any(finding.rejects_all for finding in findings):
+                        return
+                    self._bars.advance(task, len(segment.log) / segment.of)
 
 
-def _large_findings(of: tuple[RobotSetup, LogSegment]) -> list[Finding]:
+def _large_findings(setup: RobotSetup, segment: LogSegment) -> list[Finding]:
     """Reasons on a large part of a segment of a log, none where its contacts cannot be settled."""
-    setup, segment = of
     settings = setup.config.preprocessing
     try:
         flagged, _ = apply_contact_settings(segment.log, setup)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
@@ -15,7 +15,7 @@ from torchid.commands.chosen_settings import Choices
 from torchid.commands.folder import RUN, check_free, check_free_file, new_folder, write_json
 from torchid.commands.named_results import BodyEstimate, ParameterTable, body_estimate, parameter_table, run_lines
 from torchid.commands.report import DATA, report_document, write_page
-from torchid.commands.run_figures import Drawing, all_figures, drawing, figures_left, write_events, write_figures
+from torchid.commands.run_figures import draw_figures, write_events
 from torchid.commands.training import Training, body_eigenvalues
 from torchid.config import dump_config, inputs_of
 from torchid.errors import during
@@ -39,9 +39,6 @@ from torchid.problem.noise_gram import NoiseShares
 from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
 from torchid.report.forces import ForceSeries, LogForces
 from torchid.report.robot_files import refused_by_simulators
-
-if TYPE_CHECKING:
-    pass
 
 HELD_OUT = "blocks left out of the fit"
 """Name of the training samples that cross-validation predicts, in messages."""
@@ -201,7 +198,6 @@ def write_run(
     output: Path,
     overwrite: bool = False,
     training: Training | None = None,
-    begun: Sequence[Drawing] = (),
     learned: RigidPlusResidual | None = None,
 ) -> None:
     """Write the run folder.
@@ -211,7 +207,6 @@ def write_run(
         output: the folder.
         overwrite: whether a run that stands there may be replaced.
         training: whose curves go into the folder, and whose checkpoint is then no longer needed.
-        begun: figures that are being drawn.
         learned: a module beside the rigid bodies, with its parameters of these.
 
     Raises:
@@ -219,8 +214,7 @@ def write_run(
     """
     config, robot = replace(run.experiment.config, output=output), run.experiment.robot
     run = replace(run, experiment=replace(run.experiment, config=config))
-    order, left = tuple(all_figures(run)), figures_left(run, begun)
-    with during("writing", output), new_folder(output, overwrite) as folder, drawing(left, config) as rest:
+    with during("writing", output), new_folder(output, overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", _metrics_document(run))
@@ -231,7 +225,7 @@ def write_run(
         write_json(folder / DATA, report_document(run))
         if training is not None:
             training.copy_curves(folder)
-        write_events(run, folder, lambda: write_figures(folder, config.figures.format, order, [*begun, rest]))
+        write_events(run, folder, draw_figures(run, folder))
         write_page(folder, output)
     if training is not None:
         training.remove_checkpoint()
@@ -256,7 +250,7 @@ def _metrics_document(run: Identification) -> dict[str, object]:
         "contacts": run.experiment.rolling,
         "evaluated_samples": dict(run.evaluated),
         "excluded_samples": run.excluded,
-        **({"factors": [_factor_entry(one) for one in run.factors]} if run.factors else {}),
+        **({"factors": list(map(_factor_entry, run.factors))} if run.factors else {}),
         "rows": estimate.rows,
         "residual_std": estimate.residual_std,
         "misfit": _misfit_document(run.misfit),
@@ -278,7 +272,13 @@ def _metrics_document(run: Identification) -> dict[str, object]:
         "robust": None if run.robust is None else asdict(run.robust),
         "violations": run.violations_by_name(),
         "solution": _solution_document(estimate),
-        "cross_validation": _validation_document(run),
+        "cross_validation": None
+        if run.validation is None
+        else {
+            "folds": run.validation.folds,
+            "nominal": run.validation.nominal.as_dict(),
+            "identified": run.validation.identified.as_dict(),
+        },
         "ridge_selection": None if run.ridge is None else asdict(run.ridge),
         **{f"{name}_selection": x and asdict(x) for name, x in vars(run.choices).items()},
         "worse_than_nominal": [asdict(one) for one in run.worse],
@@ -308,15 +308,6 @@ def _factor_entry(factors: FactorFile) -> dict[str, object]:
     return names | {"samples": log.samples, "duration_s": factors.duration}
 
 
-def _validation_document(run: Identification) -> dict[str, object] | None:
-    """Errors on blocks of the training logs of what was fitted without them."""
-    validation = run.validation
-    if validation is None:
-        return None
-    nominal, identified = validation.nominal.as_dict(), validation.identified.as_dict()
-    return {"folds": validation.folds, "nominal": nominal, "identified": identified}
-
-
 def _identifiability_document(run: Identification) -> dict[str, object]:
     """What the data determine, and what each log and sensor adds; contact states have a list of their own."""
     estimate, contributions = run.estimate, run.contributions
@@ -335,15 +326,5 @@ def _solution_document(estimate: Estimate) -> dict[str, object] | None:
     """What is known of the optimum, or of the descent."""
     if not isinstance(estimate, ConstrainedEstimate):
         return None
-    names = (
-        "objective",
-        "unconstrained",
-        "distance",
-        "gap",
-        "steps",
-        "active",
-        "epochs",
-        "best_epoch",
-        "excess",
-    )
+    names = ["objective", "unconstrained", "distance", "gap", "steps", "active", "epochs", "best_epoch", "excess"]
     return {name: getattr(estimate, name) for name in names if hasattr(estimate, name)}

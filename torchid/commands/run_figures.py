@@ -2,38 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchid import distributed
 from torchid.commands.answer import answer
 from torchid.commands.training import body_eigenvalues, known_parameters
 from torchid.config import ExperimentConfig, dump_config
-from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate
-from torchid.fitting.cross_validation import RidgeChoice
-from torchid.identifiability.confounding import ExtraEstimate
-from torchid.identifiability.information import Contributions
-from torchid.logs.time_range import log_title
-from torchid.parallel import in_forks, share_between_processes, thread_count
+from torchid.estimators import ConstrainedEstimate, SgdEstimate
+from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.contact_state import IN_THE_AIR
 from torchid.problem.metrics import LOG_SETS
-from torchid.report.figure_style import Drawn, draw_for
+from torchid.report.figure_style import draw_for
 from torchid.report.figures import (
-    contribution_figure,
     error_figure,
     extra_figure,
     identifiability_figure,
     inertia_figure,
     parameter_figure,
-    ridge_figure,
 )
 from torchid.report.forces import ForceSeries, force_figure, pressure_figure, rows_figure, spectrum_figure
 from torchid.report.tables import table_text, verdict_counts_table
@@ -48,44 +39,23 @@ Figures = dict[str, Callable[[], "Figure"]]
 """What makes figures, by name."""
 
 
-def fit_figures(
-    robot: Robot,
-    estimate: Estimate,
-    extras: Sequence[ExtraEstimate],
-    ridge: RidgeChoice | None,
-    forces: ForceSeries | None = None,
-) -> Figures:
-    """Those that a fit alone gives, in the order in which they are to be seen."""
-    kinds = {body.joint.kind for body in robot.bodies if body.joint is not None}
-    figures = Figures()
-    if forces is not None:
-        figures |= force_figures(forces, robot)
-    figures |= {
-        "parameters": partial(parameter_figure, robot.body_names, robot.nominal, estimate, kinds, robot.format),
-        "identifiability": partial(identifiability_figure, robot.body_names, estimate),
-        "inertia": partial(inertia_figure, robot, estimate.phi.reshape(-1, PER_BODY)),
-    }
-    if extras:
-        figures["extras"] = partial(extra_figure, extras)
-    if ridge is not None:
-        figures["ridge"] = partial(ridge_figure, ridge, robot.format)
-    return figures
-
-
-def all_figures(run: Identification) -> Figures:
+def run_figures(run: Identification) -> Figures:
     """Those of a run, in the order in which they are to be seen."""
-    robot = run.experiment.robot
-    of_fit = fit_figures(robot, run.estimate, run.extras, run.ridge, run.forces)
-    figures: Figures = {name: of_fit.pop(name) for name in ("forces", "pressure") if name in of_fit}
+    robot, estimate = run.experiment.robot, run.estimate
+    kinds = {body.joint.kind for body in robot.bodies if body.joint is not None}
+    figures = Figures() if run.forces is None else force_figures(run.forces, robot)
     if run.traces is not None:
         args = run.traces, robot.dof_names, robot.base_rows, robot.sliding, robot.format
         if "forces" not in figures or run.traces.states != (IN_THE_AIR,):  # else the same once more
             figures["rows"] = partial(rows_figure, *args)
         figures["spectra"] = partial(spectrum_figure, *args)
     figures["errors"] = partial(error_figure, run.metrics, robot.format)
-    figures |= {name: of_fit.pop(name) for name in ("parameters", "identifiability", "inertia")}
-    figures["contributions"] = partial(contribution_figure, _bits(run.contributions))
-    return figures | of_fit
+    figures["parameters"] = partial(parameter_figure, robot.body_names, robot.nominal, estimate, kinds, robot.format)
+    figures["identifiability"] = partial(identifiability_figure, robot.body_names, estimate)
+    figures["inertia"] = partial(inertia_figure, robot, estimate.phi.reshape(-1, PER_BODY))
+    if run.extras:
+        figures["extras"] = partial(extra_figure, run.extras)
+    return figures
 
 
 def force_figures(series: ForceSeries, robot: Robot) -> Figures:
@@ -99,64 +69,23 @@ def force_figures(series: ForceSeries, robot: Robot) -> Figures:
     return figures
 
 
-def _bits(contributions: Contributions) -> dict[str, list[tuple[str, float]]]:
-    """Names and bits, by kind."""
-    return {
-        "logs": [(log_title(log.name), log.bits) for log in contributions.logs],
-        "contact states": [(state.name, state.bits) for state in contributions.states],
-        "sensors": [(sensor.name, sensor.bits) for sensor in contributions.sensors],
-    }
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """Figures that are being drawn: their `names`, and what waits for them."""
-
-    names: tuple[str, ...] = ()
-    wait: Callable[[], Sequence[Drawn]] = tuple
-
-
-@contextmanager
-def drawing(figures: Figures, config: ExperimentConfig) -> Iterator[Drawing]:
-    """Copies of this process that draw figures of the run of an experiment within the block, on all cores but one.
-
-    Processes that share the work call this together, and have drawn them when the block begins.
-
-    Args:
-        figures: to draw.
-        config: of the experiment, with an output.
-    """
-    folder, form = config.output or Path(), config.figures.format
+def draw_figures(run: Identification, folder: Path) -> dict[str, bytes]:
+    """Draw the figures of a run to files in a folder, on all cores; PNG of them by name, in their order."""
+    figures, form = run_figures(run), run.experiment.config.figures.format
     files = [(folder / f"{name}.{form}", make) for name, make in figures.items()]
-    if distributed.world_size() > 1:
-        there = share_between_processes(files, lambda file: draw_for(*file), distributed.world_size())
-        yield Drawing(tuple(figures), lambda: there)
-        return
-    with in_forks(files, lambda file: draw_for(*file), max(thread_count() - 1, 1)) as drawn:
-        yield Drawing(tuple(figures), drawn)
+    drawn = share_between_forks(files, lambda file: draw_for(*file), thread_count())
+    for (path, _), figure in zip(files, drawn, strict=True):
+        path.write_bytes(figure.file)
+    return {name: figure.png for name, figure in zip(figures, drawn, strict=True)}
 
 
-def figures_left(run: Identification, drawn: Iterable[Drawing]) -> Figures:
-    """Those of a run that are not being drawn yet."""
-    begun = {name for one in drawn for name in one.names}
-    return {name: figure for name, figure in all_figures(run).items() if name not in begun}
-
-
-def write_figures(folder: Path, form: str, order: Iterable[str], drawn: Iterable[Drawing]) -> Mapping[str, bytes]:
-    """Write figures to files of a type once they are drawn; PNG by name, in an order of names."""
-    done = {name: figure for one in drawn for name, figure in zip(one.names, one.wait(), strict=True)}
-    for name, figure in done.items():
-        (folder / f"{name}.{form}").write_bytes(figure.file)
-    return {name: done[name].png for name in order}
-
-
-def write_events(run: Identification, folder: Path, figures: Callable[[], Mapping[str, bytes]]) -> None:
+def write_events(run: Identification, folder: Path, figures: Mapping[str, bytes]) -> None:
     """Write errors, losses, verdicts, settings and figures of a run; a descent has written its epochs before.
 
     Args:
         run: a finished one.
         folder: of its files.
-        figures: gives PNG by name, once they are drawn.
+        figures: PNG by name.
     """
     from torchid.report.tensorboard import RunEvents  # takes 0.3 s, which runs that write nothing need not
 
@@ -165,26 +94,21 @@ def write_events(run: Identification, folder: Path, figures: Callable[[], Mappin
     last = estimate.epochs if isinstance(estimate, SgdEstimate) else 1
     with RunEvents(folder) as events:
         if not descent:  # which has said before what there is to show
-            events.write_layout(robot.body_names)
             events.write_solution(estimate, None if run.factors else run.samples / run.seconds["compress"])
         for nominal, phi in ((True, robot.nominal.flatten()), (False, estimate.phi)):
             events.write_errors(last, _errors(run, nominal), nominal=nominal)
             events.write_eigenvalues(last, body_eigenvalues(robot, phi), nominal=nominal)
-        events.write_parameters(last, known_parameters(robot, estimate, estimate.phi) | _total_mass(run))
-        if run.ridge is not None:
-            events.write_ridges(run.ridge)
+        known = known_parameters(robot, estimate, estimate.phi)
+        if run.mass.determined and np.isfinite(run.mass.standard_error):
+            known["total_mass"] = run.mass.value, run.mass.standard_error
+        events.write_parameters(last, known)
         events.write_answer(last, _answer_lines(run))
         events.write_fit(last, estimate)
         events.write_identifiability(
             last, estimate, run.contributions.total, table_text(verdict_counts_table(run.by_state, estimate))
         )
-        events.write_summary(dump_config(run.experiment.config), figures(), last)
+        events.write_summary(dump_config(run.experiment.config), figures, last)
         events.write_hyperparameters(hyperparameters(run.experiment.config), _final(run), last)
-
-
-def _total_mass(run: Identification) -> dict[str, tuple[float, float]]:
-    known = run.mass.determined and np.isfinite(run.mass.standard_error)
-    return {"total_mass": (run.mass.value, run.mass.standard_error)} if known else {}
 
 
 def _errors(run: Identification, nominal: bool) -> dict[str, Metrics]:

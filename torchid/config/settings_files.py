@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from torchid.config.yaml_text import check_text, check_yaml, explain_syntax, is_one_text, load_yaml
+from torchid.config.yaml_text import check_text, check_yaml, explain_syntax, load_yaml
 from torchid.errors import ConfigError, UnknownNameError, about_file, during, excerpt, is_plain
 from torchid.guards import MAX_DEPTH, MAX_YAML, read_bytes
 from torchid.logs import Log
@@ -148,7 +148,7 @@ def _read(kind: FileKind[T], path: Path) -> Settings:
         loaded = text = read_bytes(path, MAX_YAML).decode()
         if not text.lstrip().startswith("<"):  # XML, which a colon in a comment makes a mapping
             check_yaml(text)
-            loaded = text if is_one_text(text) else load_yaml(text)
+            loaded = load_yaml(text)
     except OSError as error:
         raise ConfigError(path, "file", f"cannot be read ({error.strerror})", f"a YAML {kind.name} file") from error
     except yaml.MarkedYAMLError as error:
@@ -156,7 +156,7 @@ def _read(kind: FileKind[T], path: Path) -> Settings:
     except _NO_YAML as error:
         raise _no_settings(kind, path, f"not readable: {_why(error)}", "a YAML mapping") from error
     if not isinstance(loaded, dict):
-        found = f"text, {excerpt(text.strip(), 40)}" if loaded is text else "a list"
+        found = "a list" if isinstance(loaded, list) else f"text, {excerpt(text.strip(), 40)}"
         raise _no_settings(kind, path, found, f"a mapping with {kind.keys}")
     return loaded
 

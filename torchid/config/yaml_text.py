@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from itertools import islice
 from typing import Any
 
 import yaml
@@ -12,70 +11,50 @@ from torchid.errors import excerpt, is_plain
 from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML
 
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_TAG = "tag:yaml.org,2002:"
+_TAG, _MAX_ALIASES = "tag:yaml.org,2002:", 100
 _FLOAT = re.compile(
     r"[-+]?([0-9][0-9_]*\.[0-9_]*([eE][-+]?[0-9]+)?|[0-9][0-9_]*[eE][-+]?[0-9]+|\.[0-9_]+([eE][-+]?[0-9]+)?"
     r"|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$"
 )
-#: Tags that settings may have; others make dates, sets or bytes, which no key accepts.
-_KINDS = ("str", "int", "float", "bool", "null", "map", "seq", "merge")
-_NUMBERS = ("int", "float", "bool", "null")
-
 #: Characters that YAML keeps for itself, and what its reader says of them.
 _RESERVED, _CANNOT_BEGIN = "%@`", "cannot start any token"
 _WIDTH = 114  # of a line that is written, without its indent
 _BRACKETS = '; names with brackets take quotes in a list: ["walk.npz[0:30]"]'
 
 
-class _Count:
-    """Entries of the collections that are open, and of those that have an anchor."""
-
-    def __init__(self) -> None:
-        self.open: list[tuple[str | None, int]] = [(None, 0)]
-        self.anchored: dict[str, int] = {}
-
-    def add(self, entries: int) -> None:
-        anchor, count = self.open[-1]
-        self.open[-1] = (anchor, count + entries)
-        if sum(count for _, count in self.open) > MAX_NODES:
-            raise ValueError(f"more than {MAX_NODES} entries, aliases unfolded")
-
-    def start(self, anchor: str | None) -> None:
-        if len(self.open) > MAX_DEPTH:
-            raise ValueError(f"nested more than {MAX_DEPTH} deep")
-        self.open.append((anchor, 0))
-
-    def end(self) -> None:
-        anchor, count = self.open.pop()
-        if anchor is not None:
-            self.anchored[anchor] = count + 1
-        self.add(count + 1)
-
-
 def check_yaml(text: str) -> None:
-    """Refuse YAML that unfolds beyond bounds, control characters, and interpolations `${...}`.
+    """Refuse YAML that unfolds beyond bounds, tags, control characters, and interpolations `${...}`.
 
     Raises:
         ValueError, yaml.YAMLError: what was found.
     """
     if len(text) > MAX_YAML:
         raise ValueError(f"more than {MAX_YAML} bytes")
-    count = _Count()
+    entries = aliases = 0
+    anchored: list[bool] = []  # of the collections that are open
     for event in yaml.parse(text, Loader=_LOADER):
-        _check_tag(event)
         if isinstance(event, yaml.AliasEvent):
-            if event.anchor not in count.anchored:
-                raise ValueError(f"'*{excerpt(str(event.anchor))}', which stands for nothing complete")
-            count.add(count.anchored[event.anchor])
+            aliases += 1
+            if any(anchored) or aliases > _MAX_ALIASES:
+                raise ValueError(f"'*{excerpt(str(event.anchor))}' within what has a name, or {_MAX_ALIASES} aliases")
         elif isinstance(event, yaml.CollectionStartEvent):
-            count.start(event.anchor)
+            anchored.append(event.anchor is not None)
+            if len(anchored) > MAX_DEPTH:
+                raise ValueError(f"nested more than {MAX_DEPTH} deep")
         elif isinstance(event, yaml.CollectionEndEvent):
-            count.end()
-        elif isinstance(event, yaml.ScalarEvent):
-            check_text(event.value)
-            count.add(1)
-            if event.anchor is not None:
-                count.anchored[event.anchor] = 1
+            anchored.pop()
+        _check_node(event)
+        entries += isinstance(event, yaml.NodeEvent)
+        if entries > MAX_NODES:
+            raise ValueError(f"more than {MAX_NODES} entries")
+
+
+def _check_node(event: yaml.Event) -> None:
+    if isinstance(event, yaml.ScalarEvent):
+        check_text(event.value)
+    tag = getattr(event, "tag", None)
+    if tag not in (None, "!"):
+        raise ValueError(f"the tag '{excerpt(tag)}', which settings have no use for")
 
 
 class _SettingsLoader(_LOADER):  # type: ignore[misc]
@@ -103,26 +82,6 @@ _SettingsLoader.add_implicit_resolver(f"{_TAG}float", _FLOAT, list("-+0123456789
 def load_yaml(text: str) -> Any:
     """The value of a YAML text, whose bounds `check_yaml` has checked. Raises yaml.YAMLError, ValueError, TypeError."""
     return yaml.load(text, Loader=_SettingsLoader)
-
-
-def is_one_text(text: str) -> bool:
-    """Whether YAML is a single text rather than a mapping or a list, as an XML file is."""
-    events = yaml.parse(text, Loader=_LOADER)
-    return isinstance(next(islice(events, 2, None), None), yaml.ScalarEvent)  # behind stream's and document's start
-
-
-def _check_tag(event: yaml.Event) -> None:
-    """Refuse a tag that contradicts its value, whose construction would fail with errors of its own."""
-    tag = getattr(event, "tag", None)
-    if tag in (None, "!"):
-        return
-    kind = tag.removeprefix(_TAG)
-    if kind not in _KINDS:
-        raise ValueError(f"the tag '{excerpt(tag)}', which settings have no use for")
-    if isinstance(event, yaml.ScalarEvent) and kind in _NUMBERS:
-        resolved = yaml.resolver.Resolver().resolve(yaml.ScalarNode, event.value, (True, False)).removeprefix(_TAG)
-        if resolved != kind and (kind, resolved) != ("float", "int"):
-            raise ValueError(f"'{excerpt(event.value)}', which is no !!{kind}")
 
 
 def check_text(value: str) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 import scipy.linalg
@@ -238,7 +237,7 @@ def resolve_meshes(root: etree._Element, urdf: Path, file: str) -> None:
     """Name meshes by full paths where MuJoCo, or whoever reads the file from another folder, would not find them.
 
     Those are meshes of collisions, and all with relative names. Visual meshes `package://` keep their names, as MuJoCo
-    skips them. Collisions with meshes that are not found, or of a format that MuJoCo does not read, become comments.
+    skips them. Collisions with meshes that MuJoCo does not find or read are left out.
 
     Args:
         root: of the URDF.
@@ -248,58 +247,24 @@ def resolve_meshes(root: etree._Element, urdf: Path, file: str) -> None:
     Warns:
         TorchidWarning: meshes of collisions that are not found, or that MuJoCo does not read.
     """
-    missing, foreign = list[str](), list[str]()
+    left_out = list[str]()
     for link in root.findall("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             mesh = shape.find("geometry/mesh")
             name = "" if mesh is None else str(mesh.get("filename", ""))
-            if mesh is None or (shape.tag == "visual" and (Path(name).is_absolute() or "://" in name)):
+            collides = shape.tag == "collision"
+            if mesh is None or (not collides and (Path(name).is_absolute() or "://" in name)):
                 continue
-            if shape.tag == "collision" and Path(name).suffix.lower() not in MUJOCO_MESHES:
-                foreign.append(name)
-                _comment_out(shape, "not of a format that MuJoCo reads")
-                continue
-            if Path(name).is_absolute():
-                continue
-            path = _found(urdf, name)
-            if path is not None:
-                mesh.set("filename", str(path.absolute()))
-            elif shape.tag == "collision":
-                missing.append(name)
-                _comment_out(shape, "not found")
-    reasons = {"that are not found": missing, f"that are none of {', '.join(MUJOCO_MESHES)}": foreign}
-    for reason, names in reasons.items():
-        if names:
-            listed = join_names(list(dict.fromkeys(names)))
-            text = f"{file}: meshes of collisions {reason}, which MuJoCo would refuse, are comments: {listed}"
-            warn(f"{text}; torchid export --format urdf keeps them")
-
-
-def _found(urdf: Path, name: str) -> Path | None:
-    """A mesh file beside the URDF, in its package or in one that ROS knows of."""
-    try:
-        return mesh_path(urdf, name)
-    except MeshError:
-        return next((path for path in _ros_paths(name) if path.is_file()), None)
-
-
-def _ros_paths(name: str) -> list[Path]:
-    """Where ROS looks for `package://NAME/...`."""
-    scheme, _, rest = name.partition("://")
-    parts = PurePosixPath(rest.lstrip("/")).parts
-    if scheme != "package" or not parts or ".." in parts:
-        return []
-    listed = [Path(x) for x in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if x]
-    own = [folder.joinpath(*parts[1:]) for folder in listed if folder.name == parts[0]]
-    shared = [Path(x) / "share" for x in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if x]
-    return [*own, *(folder.joinpath(*parts) for folder in (*listed, *shared))]
-
-
-def _comment_out(element: etree._Element, reason: str) -> None:
-    tail, element.tail = element.tail, None
-    text = etree.tostring(element, encoding="unicode").replace("--", "- -")
-    comment = etree.Comment(f" {reason}: {text} ")
-    comment.tail = tail
-    parent = element.getparent()
-    if parent is not None:
-        parent.replace(element, comment)
+            try:
+                if collides and Path(name).suffix.lower() not in MUJOCO_MESHES:
+                    raise MeshError
+                if not Path(name).is_absolute():
+                    mesh.set("filename", str(mesh_path(urdf, name).absolute()))
+            except MeshError:
+                if collides:
+                    left_out.append(name)
+                    link.remove(shape)
+    if left_out:
+        listed = join_names(list(dict.fromkeys(left_out)))
+        text = f"{file}: collisions with meshes that are not found, or are none of {', '.join(MUJOCO_MESHES)}"
+        warn(f"{text}, are left out, as MuJoCo would refuse them: {listed}; torchid export --format urdf keeps them")

@@ -63,11 +63,6 @@ class Candidate:
         return (*((None, dof) for dof in self.dofs), *((self.contact, k) for k in self.components))
 
 
-def count_channels(chosen: Iterable[Candidate]) -> int:
-    """Number of measured components of some candidates together."""
-    return len({channel for candidate in chosen for channel in candidate.readings})
-
-
 def total_cost(chosen: Iterable[Candidate]) -> float:
     """Total cost of some candidates."""
     return sum(candidate.cost for candidate in chosen)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,7 +34,7 @@ from torchid.report.analysis import (
 from torchid.report.log_checks import finding_table, group_alike, log_heading, skipped_checks_text
 from torchid.report.tables import print_tables, terminal_width
 from torchid.sensor_planning.observability import BaseObservability
-from torchid.terminal.lines import CUT, LABEL, LINES, column_lines, labelled, print_labelled, print_rolling, wrap_words
+from torchid.terminal.lines import LABEL, LINES, labelled, print_labelled, print_rolling, rows_within, wrap_words
 
 _MOST_ATTENTION, _TEXT_LINES = 2, 2
 _MOST_SCENARIOS = 4
@@ -153,22 +152,19 @@ def _smallest_text(scenario: ScenarioAnalysis) -> str:
 
 
 def _scenario_lines(scenarios: Sequence[ScenarioAnalysis], width: int) -> list[str]:
-    shown = scenarios[:_MOST_SCENARIOS]
-    states = [_judged_states(one) for one in shown]
+    states = [_judged_states(one) for one in scenarios]
+    lost = [f"{_lost(one)} of {len(of)} states" if of else "" for one, of in zip(scenarios, states, strict=True)]
     columns = [
-        (
-            "base lost in",
-            [f"{_lost(one)} of {len(of)} states" if of else "" for one, of in zip(shown, states, strict=True)],
-        ),
-        ("combinations", [f"{one.base.rank} of {int(one.base.free.sum())}" for one in shown]),
-        ("smallest set", [format_count(len(one.plan.chosen), "sensor") for one in shown]),
-        ("cost", [f"{one.plan.cost:g}" for one in shown]),
-        ("proven", ["yes" if one.plan.proven else "no" for one in shown]),
+        ("base lost in", lost),
+        ("combinations", [f"{one.base.rank} of {int(one.base.free.sum())}" for one in scenarios]),
+        ("smallest set", [format_count(len(one.plan.chosen), "sensor") for one in scenarios]),
+        ("cost", [f"{one.plan.cost:g}" for one in scenarios]),
+        ("proven", ["yes" if one.plan.proven else "no" for one in scenarios]),
     ]
-    lines = column_lines(("scenario", [one.name for one in shown]), columns, width)
-    if len(scenarios) > len(shown):
-        lines.append(f"and {len(scenarios) - len(shown)} scenarios more: analysis.json, --verbose")
-    return lines
+    names = [one.name for one in scenarios]
+    return rows_within(
+        ("scenario", names), columns, width, _MOST_SCENARIOS + 2, "scenarios more: analysis.json, --verbose"
+    )
 
 
 def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Iterator[str]:
@@ -197,20 +193,16 @@ def _accuracy_lines(sets: Mapping[str, SetAccuracy], room: int, width: int) -> l
     """A table of the errors of sensor sets, measured if there were test logs, in so many lines."""
     if all(found.measured is None for found in sets.values()):
         return []
-    most = room - 2 if len(sets) <= room - 2 else room - 3  # an empty line, a heading, how many others there are
-    if most < 1:
+    if room < _FEWEST_ROWS:
         return labelled("compared", f"{format_count(len(sets), 'sensor set')}: analysis.json, --verbose", width)
-    shown = dict(list(sets.items())[:most])
-    errors = [found.measured.rms for found in shown.values() if found.measured is not None]
+    errors = [found.measured.rms for found in sets.values() if found.measured is not None]
     columns = [
         (label, ["" if (rms := of.get(group)) is None else f"{rms:.3g}" for of in errors])
         for group, label in ROW_GROUPS.items()
     ]
-    columns += [("rank", [str(found.rank) for found in shown.values()])]
-    lines = column_lines(("rms error, measured", list(shown)), columns, width)
-    if len(sets) > len(shown):
-        lines.append(f"and {len(sets) - len(shown)} sensor sets more: analysis.json, --verbose")
-    return ["", *lines]
+    columns += [("rank", [str(found.rank) for found in sets.values()])]
+    names = ("rms error, measured", list(sets))
+    return ["", *rows_within(names, columns, width, room - 1, "sensor sets more: analysis.json, --verbose")]
 
 
 # --------------------------------------------------------------------------------------------------------- all tables
@@ -240,9 +232,6 @@ def _print_scenario(scenario: ScenarioAnalysis) -> None:
     print()
 
 
-#: Lines of a finding and of a note, the first in which all have room.
-_LEVELS = ((None, None), (None, _TEXT_LINES), (_TEXT_LINES + 1, _TEXT_LINES), (_TEXT_LINES, _TEXT_LINES))
-_NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\w.+-]*")
 _NAMED = 2  # logs of a finding
 _FEWEST_ROWS = 4  # of the table of logs: empty line, heading, a log, how many others there are
 
@@ -337,24 +326,17 @@ def _verdict(checked: Sequence[Checked]) -> str:
 
 
 def _finding_lines(found: Sequence[_Alike], room: int, width: int, logs: int) -> list[str]:
-    """The findings in at most so many lines, whole if they fit; else the last line counts what is not shown.
-
-    Notes are shortened first, and those that have no room are left out before other findings are shortened.
-    """
-    severe = sum(one.first.severity != NOTE for one in found)
-    texts, shown = [], 0
-    for most, of_note in _LEVELS if found else ():
-        limits = (of_note if one.first.severity == NOTE else most for one in found)
-        texts = [_finding_text(one, width, logs, limit) for one, limit in zip(found, limits, strict=True)]
+    """The findings in at most so many lines, whole if they fit; else the last line counts what is not shown."""
+    texts: list[list[str]] = []
+    for most in (None, _TEXT_LINES):
+        texts = [_finding_text(one, width, logs, most) for one in found]
         lines = [line for text in texts for line in text]
-        whole = not any(line.endswith(CUT) for line in lines) and all(len(one.by_log) == 1 for one in found)
-        end = [] if whole else ["all in full: --verbose"]
+        is_whole = most is None and all(len(one.by_log) == 1 for one in found)
+        end = [] if is_whole else ["all in full: --verbose"]
         if len(lines) + len(end) <= room:
             return lines + end
-        shown = sum(last < room for last in accumulate(map(len, texts[:-1])))
-        if of_note and shown >= max(severe, 1):
-            break
-    return [*(line for text in texts[:shown] for line in text), _hidden_text(found[shown:])] if found else []
+    shown = sum(last < room for last in accumulate(map(len, texts)))
+    return [*(line for text in texts[:shown] for line in text), _hidden_text(found[shown:])]
 
 
 def _finding_text(one: _Alike, width: int, logs: int, most: int | None) -> list[str]:
@@ -377,19 +359,15 @@ def _hidden_text(found: Sequence[_Alike]) -> str:
 def _log_lines(checked: Sequence[Checked], room: int, width: int) -> list[str]:
     """A table of the logs, the worst first, in at most so many lines."""
     order = sorted(checked, key=_severity, reverse=True)
-    most = room - 2 if len(checked) <= room - 2 else room - 3  # an empty line, a heading, how many others there are
-    shown = order[: max(most, 1)]
-    counts = [Counter(finding.severity for finding in log.findings) for log in shown]
+    counts = [Counter(finding.severity for finding in log.findings) for log in order]
     columns = [
-        ("usable", [_usable_text(log) for log in shown]),
+        ("usable", [_usable_text(log) for log in order]),
         *((severity, [str(count[severity] or "") for count in counts]) for severity in SEVERITIES),
-        ("samples", [str(len(log.log)) for log in shown]),
-        ("seconds", [f"{log.log.time[-1] - log.log.time[0]:.4g}" for log in shown]),
+        ("samples", [str(len(log.log)) for log in order]),
+        ("seconds", [f"{log.log.time[-1] - log.log.time[0]:.4g}" for log in order]),
     ]
-    lines = column_lines(("log", [log_title(log.log.source) for log in shown]), columns, width)
-    if len(checked) > len(shown):
-        lines.append(f"and {format_count(len(checked) - len(shown), 'log')} more, no worse than these: --verbose")
-    return ["", *lines]
+    names = ("log", [log_title(log.log.source) for log in order])
+    return ["", *rows_within(names, columns, width, room - 1, "logs more, no worse than these: --verbose")]
 
 
 def _severity(log: Checked) -> tuple[float, ...]:
@@ -403,16 +381,15 @@ def _usable_text(log: Checked) -> str:
 
 
 def _skipped_lines(checked: Sequence[Checked], most: int, width: int) -> list[str]:
-    """Checks that could not be made, with the reasons, and the number of logs if it is not all."""
-    alike: dict[tuple[str, str], list[str]] = {}  # but for numbers, one of each log
-    for log in checked:
-        for key, reason in {(skip.name, _NUMBER.sub("", skip.reason)): skip.reason for skip in log.skipped}.items():
-            alike.setdefault(key, []).append(reason)
+    """Checks that could not be made, each with the reasons of the first log that gives some, and how many logs do."""
     reasons: dict[str, list[str]] = {}
-    for (name, _), of_logs in alike.items():
-        or_alike = " or alike" if len(set(of_logs)) > 1 else ""
-        of_some = "" if len(of_logs) == len(checked) else f", {len(of_logs)} of {len(checked)} logs"
-        reasons.setdefault(name, []).append(f"{of_logs[0]}{or_alike}{of_some}")
-    texts = [f"{name} ({'; '.join(of_name)})" for name, of_name in reasons.items()]
+    for log in checked:
+        for name, reason in {skip.name: skip.reason for skip in log.skipped}.items():
+            reasons.setdefault(name, []).append(reason)
+    texts = []
+    for name, of_logs in reasons.items():
+        alike = " or alike" if len(set(of_logs)) > 1 else ""
+        some = "" if len(of_logs) == len(checked) else f", {len(of_logs)} of {len(checked)} logs"
+        texts.append(f"{name} ({of_logs[0]}{alike}{some})")
     text = f"{format_count(len(texts), 'check')}: {'; '.join(texts)}"
     return labelled("not checked", text, width, most) if texts else []

@@ -55,6 +55,7 @@ from torchid.terminal.lines import (
     print_labelled,
     print_noise,
     print_rolling,
+    rows_within,
     wrap_words,
 )
 
@@ -293,17 +294,14 @@ def compression_lines(files: Sequence[CompressedFile], width: int, most: int | N
     samples, size = (sum(x) for x in zip(*((one.samples, one.size) for one in files), strict=True))
     said = f"{format_count(len(files), 'log')}, {format_count(samples, 'sample')}, in {size / 1e6:.3g} MB of factors"
     head = wrap_words(said, width)
-    room = len(files) if most is None else most - len(head) - 3  # a heading, how many more there are, the folder
-    shown = files if len(files) <= room else files[: max(room, 1)]
+    room = len(files) + 2 if most is None else most - len(head) - 1  # the folder
     columns = [
-        ("samples", [str(one.samples) for one in shown]),
-        ("kB", [f"{one.size / 1e3:.0f}" for one in shown]),
-        ("rows", [str(one.rows) for one in shown]),
-        ("contact states", [str(one.states) for one in shown]),
+        ("samples", [str(one.samples) for one in files]),
+        ("kB", [f"{one.size / 1e3:.0f}" for one in files]),
+        ("rows", [str(one.rows) for one in files]),
+        ("contact states", [str(one.states) for one in files]),
     ]
-    left = len(files) - len(shown)
-    rest = [f"and {format_count(left, 'file')} more: --verbose"] if left else []
-    return [*head, *column_lines(("file", [one.name for one in shown]), columns, width), *rest]
+    return [*head, *rows_within(("file", [one.name for one in files]), columns, width, room, "files more: --verbose")]
 
 
 MOST_LOGS = 8

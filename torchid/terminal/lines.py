@@ -84,6 +84,25 @@ def column_lines(
         shown.pop()
 
 
+def rows_within(
+    names: tuple[str, Sequence[str]], columns: Sequence[tuple[str, Sequence[str]]], width: int, room: int, others: str
+) -> list[str]:
+    """As `column_lines`, of the first rows that fit in so many lines, the last of which counts the others.
+
+    Args:
+        names: heading and names of the rows.
+        columns: heading and cells of each.
+        width: of the lines.
+        room: lines, at least a heading, a row and a count.
+        others: what the rows are that are not shown, and where they are.
+    """
+    count = len(names[1])
+    most = max(room - 1 if count < room else room - 2, 1)
+    shown = [(heading, cells[:most]) for heading, cells in columns]
+    lines = column_lines((names[0], names[1][:most]), shown, width)
+    return lines if count <= most else [*lines, f"and {count - most} {others}"]
+
+
 def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int, of: str) -> list[str]:
     """A small table of the errors of an `ErrorComparison`, not wider than so many columns; none without errors.
 

@@ -15,7 +15,7 @@ from torchid.config import SimulationConfig
 from torchid.errors import format_count, format_percent
 from torchid.report.tables import print_tables, stability_table, terminal_width
 from torchid.simulation import Stability
-from torchid.terminal.lines import LABEL, LINES, column_lines, labelled, print_rolling, wrap_words
+from torchid.terminal.lines import LABEL, LINES, column_lines, labelled, print_rolling, rows_within, wrap_words
 
 _TEXT_LINES = 2
 
@@ -71,8 +71,7 @@ def _motion_lines(config: SimulationConfig, stabilities: Mapping[str, Stability]
         return max(one.slip / bounds.slip_m, one.height_change / bounds.height_m, one.effort, near)
 
     order = sorted(stabilities, key=lambda name: use(stabilities[name]), reverse=True)
-    shown = order[: room - 1 if len(order) < room else room - 2]  # a heading, how many others there are
-    found = [stabilities[name] for name in shown]
+    found = [stabilities[name] for name in order]
     columns = [
         ("slip [mm]", [f"{1e3 * one.slip:.1f}" for one in found]),
         ("ZMP inside by [mm]", [f"{1e3 * one.zmp_margin:.0f}" for one in found]),
@@ -80,10 +79,7 @@ def _motion_lines(config: SimulationConfig, stabilities: Mapping[str, Stability]
         ("base height [m]", ["{:.3f} to {:.3f}".format(*one.base_height) for one in found]),
         ("feet up [%]", [", ".join(f"{100 * share:.0f}" for share in one.unloaded) for one in found]),
     ]
-    lines = column_lines(("motion", shown), columns, width)
-    if len(order) > len(shown):
-        lines.append(f"and {format_count(len(order) - len(shown), 'motion')} farther from the bounds: --verbose")
-    return lines
+    return rows_within(("motion", order), columns, width, room, "motions farther from the bounds: --verbose")
 
 
 _MOST = 6  # joints in the answer
@@ -114,14 +110,13 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
                 column.append(" to ".join(f"{x:.3g}" for x in replayed.ranges_at(share * replayed.window)[name]))
     lines += column_lines(("median drift after", names), columns, width)
     joints = sorted(replayed.by_joint().items(), key=lambda x: -x[1].identified)
-    few = joints if verbose else joints[:_MOST]
     cells = [
-        (replayed.of, [f"{x.nominal:.4g}" for _, x in few]),
-        ("identified", [f"{x.identified:.4g}" for _, x in few]),
+        (replayed.of, [f"{x.nominal:.4g}" for _, x in joints]),
+        ("identified", [f"{x.identified:.4g}" for _, x in joints]),
     ]
-    lines += ["", *column_lines((f"joint, after {replayed.window:g} s", [name for name, _ in few]), cells, width)]
-    if len(few) < len(joints):
-        lines.append(f"and {format_count(len(joints) - len(few), 'joint')} drifting less: --verbose")
+    headings = (f"joint, after {replayed.window:g} s", [name for name, _ in joints])
+    room = len(joints) + 1 if verbose else _MOST + 2
+    lines += ["", *rows_within(headings, cells, width, room, "joints drifting less: --verbose")]
     if replayed.output is not None:
         lines.append(f"{'written to':{LABEL}}{replayed.output}")
     return lines
