@@ -46,20 +46,7 @@ pytestmark = pytest.mark.usefixtures("events")
 
 def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Path) -> None:
     names = {"events" if path.name.startswith("events") else path.name for path in run.iterdir()}
-    figures = {
-        f"{name}.png"
-        for name in (
-            "forces",
-            "pressure",
-            "rows",
-            "spectra",
-            "errors",
-            "parameters",
-            "identifiability",
-            "inertia",
-            "contributions",
-        )
-    }
+    figures = {f"{name}.png" for name in OF_A_RUN}
     results = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "manifest.json"}
     results |= {"report.json", "posterior.npz"}
     assert names == {"events", *results, *figures}
