@@ -161,7 +161,7 @@ def _inspect(top: Path, above: str, manifest: Manifest, kind: FolderKind, conten
         elif stat.S_ISREG(mode) and name in manifest.files:
             is_unchanged = file_checksum(path) == manifest.files[name]
             contents.files.append(path) if is_unchanged else contents.changed.append(excerpt(name))
-        elif stat.S_ISREG(mode) and not above and any(fnmatchcase(name, pattern) for pattern in kind.growing):
+        elif stat.S_ISREG(mode) and any(fnmatchcase(name, pattern) for pattern in (f".{MANIFEST}", *kind.growing)):
             contents.files.append(path)
         else:
             contents.foreign.append(excerpt(name))
