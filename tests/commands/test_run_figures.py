@@ -43,7 +43,7 @@ def test_figures_for_print_come_from_all_commands_and_tensorboard_keeps_its_pict
     assert main(["analyze", experiment, f"output={tmp_path / 'other'}", *given]) == 0
     written = list(tmp_path.rglob("*.pdf"))
     assert {path.stem for path in written} == {*OF_A_RUN, "drift", "accuracy"}
-    assert len(written) == len(OF_A_RUN) + 6
+    assert len(written) == len(OF_A_RUN) + 5
     for path in written:
         assert path.read_bytes().startswith(_BEGINS["pdf"])
     assert not list(tmp_path.rglob("*.png"))
