@@ -25,8 +25,8 @@ from torchid.errors import (
     warn,
     warn_about_file,
 )
+from torchid.logs.log import UnknownFieldError
 from torchid.logs.preprocess import preprocess
-from torchid.logs.read import UnknownFieldError
 
 PLAIN = [kind("a.yaml", "field", "a\nb", "c") for kind in (InputError, UrdfError, LogError, ConfigError, SensorError)]
 NAMED = [kind("a.yaml", "field", "l_nee", ("l_knee", "r_knee")) for kind in (UnknownNameError, UnknownFieldError)]
