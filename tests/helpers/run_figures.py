@@ -13,11 +13,13 @@ from matplotlib.figure import Figure
 from torchid.report import figure_style
 
 FIGURES = (
-    *("force_figure", "error_figure", "parameter_figure", "identifiability_figure"),
+    *("force_figure", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure"),
     *("rows_figure", "spectrum_figure", "inertia_figure"),
-    *("pressure_figure", "extra_figure", "accuracy_figure"),
+    *("pressure_figure", "extra_figure", "ridge_figure", "tree_figure", "accuracy_figure"),
 )
-OF_A_RUN = (*("forces", "pressure", "rows", "spectra", "errors", "parameters", "identifiability", "inertia"),)
+OF_A_RUN = (
+    *("forces", "pressure", "rows", "spectra", "errors", "parameters", "identifiability", "inertia", "contributions"),
+)
 """Names of the figures that every run of logs has, in their order."""
 
 PAGE, EVENTS = "write_page", "write_events"

@@ -19,8 +19,9 @@ from torchid.config import load_config
 from torchid.estimators import SgdEstimate
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED, ConstrainedEstimate
 from torchid.fitting.noise import unexplained_torques
-from torchid.parameters import INERTIAL, PER_BODY
-from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WorseThanNominal
+from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY
+from torchid.problem import Metrics
+from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
 from torchid.sensing import named_sensors
 from torchid.terminal.identification import answer_lines
 from torchid.terminal.lines import LINES
@@ -82,6 +83,22 @@ def test_joints_that_rest_are_named_where_forces_are_not_explained(consistent: I
     assert "stiction" not in text(resting)
 
 
+def test_joints_that_never_move_are_named_where_their_torque_counts_as_unmeasured(consistent: Identification) -> None:
+    config = consistent.experiment.config
+    taken = replace(config, actuators=replace(config.actuators, stiction=True))
+    run = replace(consistent, experiment=replace(consistent.experiment, config=taken))
+    assert "stiction" not in text(replace(run, resting={"rear_left_hip": 0.9}))
+    said = " ".join(text(replace(run, resting={"front_left_knee": 1.0, "rear_left_hip": 0.9})).split())
+    assert "no friction of front_left_knee: at rest, or too near to it for the filter, throughout" in said
+
+
+def test_errors_on_motion_that_was_fitted_are_not_those_of_unseen_motion(consistent: Identification) -> None:
+    config = consistent.experiment.config
+    fitted = replace(config, logs=replace(config.logs, test=config.logs.train))
+    said = text(replace(consistent, experiment=replace(consistent.experiment, config=fitted)))
+    assert said.startswith("Much better than the URDF on motion that the fit has seen (sway_train.npz)")
+
+
 def test_logs_in_which_nothing_moves_judge_neither_inertia_nor_friction(
     consistent: Identification, free: Identification
 ) -> None:
@@ -104,6 +121,18 @@ def test_without_test_logs_blocks_left_out_are_judged_and_the_text_says_so(free:
     assert "joints and base axes, worse in " in first
     assert free.validation is not None
     assert f"{free.validation.identified.rms['joint_torque']:.4g}" in text(free)
+
+
+def test_projected_forces_are_shown_where_no_joint_or_base_force_can_be(consistent: Identification) -> None:
+    def without_others(metrics: Metrics) -> Metrics:
+        return replace(metrics, rms={name: metrics.rms[name] for name in ("nullspace", WHITENED)})
+
+    pair = consistent.metrics["test"]
+    fewer = pair._replace(nominal=without_others(pair.nominal), identified=without_others(pair.identified))
+    said = text(replace(consistent, metrics=consistent.metrics | {"test": fewer}))
+    assert f"{pair.identified.rms['nullspace']:.4g}" in said.split("projected [N, N m]")[1].split("\n")[0]
+    assert "base force" not in said
+    assert "projected" not in text(consistent)
 
 
 def test_bodies_that_cannot_exist_are_counted_with_what_to_do(consistent: Identification, free: Identification) -> None:
@@ -130,6 +159,13 @@ def test_a_total_mass_that_contradicts_the_urdf_needs_attention(consistent: Iden
     assert "times the URDF's" not in text(vague)
 
 
+def test_bodies_that_a_weak_prior_lets_go_far_from_the_urdf_are_said_to_weigh_so(consistent: Identification) -> None:
+    unknown, nominal = replace(consistent.mass, standard_error=np.inf), consistent.mass.nominal
+    near, far = (text(replace(consistent, mass=replace(unknown, value=x * nominal)), 400) for x in (1.1, 5.0))
+    assert "attention     these data do not determine the total mass; weigh the robot: estimator.total_mass" in near
+    assert "and the fit lets it be 104.000 kg (20.800 kg by the URDF)" in far
+
+
 @pytest.mark.parametrize(("variation", "of_weight", "told"), [(1.4, 0.5, True), (1.4, 0.01, False), (0.5, 0.5, False)])
 def test_a_base_force_that_a_constant_would_predict_as_well_is_not_explained(
     consistent: Identification, variation: float, of_weight: float, told: bool
@@ -140,6 +176,24 @@ def test_a_base_force_that_a_constant_would_predict_as_well_is_not_explained(
     said = text(replace(consistent, metrics=consistent.metrics | {"test": pair._replace(identified=found)}), 400)
     assert ("attention     base force: errors of 1.4 times what its measurements vary by; check frames" in said) is told
     assert ("model does not explain these forces" in said.split("rms error")[0]) is told
+
+
+@pytest.mark.parametrize(("share", "told"), [(5e-4, True), (2e-3, False)])
+def test_forces_that_the_file_itself_predicts_are_said_to_be_computed(
+    consistent: Identification, share: float, told: bool
+) -> None:
+    pair = consistent.metrics["test"]
+    near = replace(pair.nominal, relative=dict.fromkeys(pair.nominal.relative, share))
+    metrics = consistent.metrics | {"test": pair._replace(nominal=near)}
+    assert ("were they computed from it" in text(replace(consistent, metrics=metrics), 200)) == told
+
+
+def test_projected_forces_that_no_bodies_would_predict_as_well_are_not_explained(consistent: Identification) -> None:
+    pair = consistent.metrics["test"]
+    found = replace(pair.identified, relative={**pair.identified.relative, "nullspace": 1.31})
+    said = text(replace(consistent, metrics=consistent.metrics | {"test": pair._replace(identified=found)}), 400)
+    assert "errors of 1.3 times what was measured; check signs, units and order of joints: torchid check" in said
+    assert "what was measured" not in text(consistent, 400)
 
 
 @pytest.mark.parametrize(
@@ -171,6 +225,31 @@ def test_a_fit_that_leaves_most_of_the_torques_is_not_explained_by_other_forces(
     assert unexplained_torques(found, sensors) == "the fit leaves 70 % of the joint torques" * told
 
 
+def test_bodies_that_are_heavy_without_data_are_named_together_with_a_ridge_that_was_not_tried(
+    consistent: Identification,
+) -> None:
+    robot, estimate = consistent.experiment.robot, consistent.estimate
+    phi, known = estimate.phi.copy(), estimate.identifiable.copy()
+    known[PER_BODY : 3 * PER_BODY] = False
+    phi[[PER_BODY, 2 * PER_BODY]] = [5.0, 3.0] * robot.nominal[[1, 2], 0]
+    said = text(replace(consistent, estimate=replace(estimate, phi=phi, identifiable=known)), 400)
+    names, ridge = robot.body_names, consistent.experiment.config.estimator.ridge
+    assert f"attention     {names[1]} 5 times, {names[2]} 3 times the URDF's mass, which the data do not" in said
+    assert f"an estimator.ridge above {ridge}" in said
+
+
+@pytest.mark.parametrize(("errors", "told"), [(-5.0, True), (-3.0, False)])
+def test_friction_that_drives_a_joint_beyond_its_errors_points_to_a_reversed_torque(
+    consistent: Identification, errors: float, told: bool
+) -> None:
+    phi, at = consistent.estimate.phi.copy(), 2 * PER_BODY + COULOMB
+    phi[at] = errors * consistent.estimate.standard_error[at]
+    said = text(replace(consistent, estimate=replace(consistent.estimate, phi=phi)), 400)
+    body = consistent.experiment.robot.bodies[2]
+    assert body.joint is not None
+    assert (f"friction drives {body.joint.name}: its torque is reversed" in said) is told
+
+
 @pytest.mark.parametrize(("share", "unlike"), [(0.3, True), (0.6, False)])
 def test_bodies_far_off_their_file_need_a_wider_prior_and_a_line_says_which(
     consistent: Identification, share: float, unlike: bool
@@ -186,6 +265,17 @@ def test_bodies_far_off_their_file_need_a_wider_prior_and_a_line_says_which(
     assert "--prior-error" not in text(consistent, 400)
 
 
+def test_a_rod_in_the_file_is_named_where_bodies_are_far_off_it(consistent: Identification) -> None:
+    """A small error across a body without thickness is a large share: the file may be the robot's all the same."""
+    fitted = consistent.posterior
+    thin = fitted.posterior.nominal.copy()
+    thin.reshape(-1, PER_BODY)[:, INERTIAL] *= 0.3
+    thin.reshape(-1, PER_BODY)[2, INERTIAL] = [1.0, 0.0, 0.0, 0.1, 0.02, 0.0, 0.0, 0.02, 0.0, 0.0]
+    wrong = replace(fitted, posterior=replace(fitted.posterior, nominal=thin))
+    said = text(replace(consistent, posterior=wrong), 400)
+    assert f"the file is another robot's, or it has rods or plates ({fitted.body_names[2]});" in said
+
+
 def test_a_descent_that_ended_above_the_optimum_says_so(consistent: Identification) -> None:
     own = {x.name for x in fields(ConstrainedEstimate)}
     shared = {name: x for name, x in vars(consistent.estimate).items() if name in own}
@@ -194,6 +284,22 @@ def test_a_descent_that_ended_above_the_optimum_says_so(consistent: Identificati
         said = text(replace(consistent, estimate=SgdEstimate(**shared | descent)), 400)
         assert ("attention     not converged" in said) is told
         assert ("not converged: 29 % above the optimum" in said) is (excess == 0.29)
+
+
+def test_intervals_that_count_noise_alone_say_so(consistent: Identification) -> None:
+    assert consistent.estimate.block_error is not None
+    assert "count noise alone" not in text(consistent, 400)
+    short = replace(consistent, samples=50, estimate=replace(consistent.estimate, block_error=None, oversampling=2.0))
+    said = text(short, 400)
+    assert "attention     95 % intervals count noise alone, no error of the model, which 25 independent samples" in said
+
+
+def test_residuals_that_cannot_contradict_the_model_are_said_to_show_nothing(consistent: Identification) -> None:
+    assert consistent.misfit.judged
+    short = replace(consistent, misfit=replace(consistent.misfit, expected=None, lack_of_fit=None))
+    said = text(short, 400)
+    assert "attention     whether the model explains these forces is not known" in said
+    assert "sensors.noise" in said
 
 
 def test_errors_of_a_sensor_in_a_limb_are_shown_and_need_attention_where_they_exceed_its_readings(
@@ -254,6 +360,22 @@ def test_the_bodies_that_changed_most_are_listed_in_the_robots_order(consistent:
             assert error == pytest.approx(errors[body, k], rel=0.1)
     assert f"and {13 - len(rows)} bodies whose mass changed less" in "\n".join(lines)
     assert "+ known only in sums with other bodies" in lines
+
+
+def test_friction_that_no_joint_shows_has_no_columns(consistent: Identification) -> None:
+    observable = consistent.estimate.observable.reshape(-1, PER_BODY).copy()
+    observable[:, FRICTION] = False
+    unseen = replace(consistent, estimate=replace(consistent.estimate, observable=observable.ravel()))
+    for run, shown in ((consistent, True), (unseen, False)):
+        assert any("Coulomb" in line for line in answer_lines(run, 120)) == shown
+
+
+def test_names_are_never_broken_however_narrow_the_terminal(consistent: Identification) -> None:
+    for width in WIDTHS:
+        lines = answer_lines(consistent, width)
+        start = next(k for k, line in enumerate(lines) if line.startswith("body "))
+        for line in lines[start + 1 : start + 4]:
+            assert line.split()[0] in consistent.experiment.robot.body_names
 
 
 @pytest.mark.filterwarnings(UNPHYSICAL)

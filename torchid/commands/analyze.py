@@ -24,6 +24,7 @@ from torchid.fitting.left_out import Evidence, leave_sensors_out
 from torchid.fitting.noise import unmeasured_at_rest
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
 from torchid.parallel import one_thread
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.contact_state import ContactState
@@ -40,6 +41,7 @@ from torchid.report.analysis import (
     sensor_plan_document,
 )
 from torchid.report.figure_style import save_figures
+from torchid.report.figures import tree_figure
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.sensing import Contact, SensorSet
@@ -59,7 +61,7 @@ from torchid.sensor_planning.planner import (
 )
 
 if TYPE_CHECKING:
-    pass
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -421,13 +423,36 @@ def _is_chosen(choice: SensorPlan, sensors: SensorSet, contacts: Sequence[Contac
 def _write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -> None:
     """Write the folder; one that stands there may be replaced with `overwrite`."""
     setup, names = analysis.setup, analysis.setup.robot.body_names
-    texts = []
+    texts, figures = [], {}
     for scenario in analysis.scenarios:
         which = "planned" if scenario.proposed is None else "proposed"
         texts.append(base_parameters_text(f"{scenario.name}, {which} sensors", scenario.base, names))
+        figures[f"sensors-{scenario.name}"] = _picture(setup, scenario)
+    if any(found.measured is not None for found in analysis.accuracies.values()):
+        figures["accuracy"] = accuracy_figure(analysis.accuracies)
     with during("writing", output), new_folder(output, overwrite, ANALYSIS) as folder:
         (folder / "config.yaml").write_text(dump_config(setup.config))
         write_json(folder / "analysis.json", analysis.to_dict())
         (folder / "base_parameters.txt").write_text("\n\n".join(texts))
-        if any(found.measured is not None for found in analysis.accuracies.values()):
-            save_figures({"accuracy": accuracy_figure(analysis.accuracies)}, folder, setup.config.figures.format)
+        save_figures(figures, folder, setup.config.figures.format)
+
+
+def _picture(setup: RobotSetup, scenario: ScenarioAnalysis) -> Figure:
+    """The robot's tree with the planned sensors."""
+    plan, robot = scenario.plan, setup.robot
+    sensors = sensor_set(robot, setup.contacts, plan.chosen)
+    used = [c for c, *active in zip(setup.contacts, *scenario.states, strict=True) if any(active)]
+    wrenches = {
+        contact.frame: [
+            WRENCH_COMPONENTS[k] if row[0] else contact.component_name(k) for k in np.flatnonzero(row).tolist()
+        ]
+        for contact, row in zip(plan.problem.contacts, sensors.wrench, strict=True)
+    }
+    measured = [name for name, taken in zip(robot.dof_names, sensors.torque, strict=True) if taken]
+    constrained = [joint for branch in plan.branches if branch.constrained for joint in branch.joints]
+    channels, possible = (
+        len({channel for candidate in sensors for channel in candidate.readings})
+        for sensors in (plan.chosen, plan.problem.candidates)
+    )
+    title = f"{scenario.name}: {channels} of {possible} sensor channels"
+    return tree_figure(title, robot, used, measured, wrenches, constrained)

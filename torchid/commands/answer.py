@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,11 +11,14 @@ import numpy as np
 from torchid.config.logs import tests_on_seen_samples
 from torchid.errors import format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
+from torchid.estimators.least_squares import IDENTIFIED
 from torchid.fitting.calibration import Confounded, list_confounded
 from torchid.fitting.noise import AT_THE_FLOOR, unexplained_joints
 from torchid.fitting.posterior import FittedPosterior
 from torchid.log_checks.contacts import MAX_MASS_ERROR
+from torchid.logs.columns import values_by_name
 from torchid.logs.time_range import log_title
+from torchid.parameters import COULOMB, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import (
     ADVICE,
@@ -102,10 +105,11 @@ class ErrorComparison:
 
 _LARGER_THAN_MEASURED = 1.05  # errors over the measured, of sensors that any fit of their limb explains better
 _MUCH_MORE = 1.5  # residuals of bodies that can exist over the least: 1.001 of honest logs, 1.9 to 30 with a unit wrong
-_EXACT_SHARE = (
-    1e-3  # of what the nominal parameters leave: signals without noise, of which a solver's tolerance is left
-)
+_EXACT_SHARE = 1e-3  # of what the nominal parameters leave: signals without noise, of which rounding is left
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
+_HEAVY = 2.0  # times the mass in the robot's file
+_COMPUTED = 1e-3  # of the measured, to which no file predicts what a real robot does: friction alone is more
+_ALIKE, _DIFFERENT, _SAME_STEP = 0.2, 1.5, 0.1  # of armatures over kd, relative; of gains; of a step, relative
 _ANOTHER_ROBOT = 1.0  # of each body that data determine: no file of the same robot is off by so much
 
 
@@ -210,12 +214,15 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         (bool(run.suspected), f"torchid check finds in {run.suspected}"),
         *((True, text) for text in _unfinished(estimate)),
         *((True, text) for text in _unlike_sensors(judged.identified)),
+        *((True, text) for text in _computed(judged)),
         (bool(terms), f"negative, which nothing is: {join_names(terms)}; estimator.name=consistent finds the best "
                       "that can be"),
         (growth > _MUCH_MORE and (run.misfit.share or 0.0) > _EXACT_SHARE,
          f"no bodies that can exist explain these forces: they leave {growth:.2g} times as much as bodies that cannot; "
          "unit, gear or sign of a torque? (torchid check)"),
+        *((True, text) for text in _driving(run)),
         *((True, text) for text in _unlike_joints(run)),
+        *((True, text) for text in _heavy(run)),
         (not run.misfit.explained,
          "friction, compliance or contacts are missing, or a sensor is wrong (torchid check): "
          f"{run.misfit.in_short}"),
@@ -228,6 +235,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
         (estimate.block_error is None,
          f"95 % intervals count noise alone, no error of the model, which {independent} do not show: record more"),
         (is_open, f"these data do not determine the total mass{let}; weigh the robot: estimator.total_mass"),
+        *((True, text) for text in _implicit(run)),
         *((True, one.in_short) for one in _confounded(run)),
         *((True, text) for text in _far_off(run.posterior)),
         (bool(run.noise.suggested), f"noise: {noise_advice(run.noise.suggested)}"),
@@ -273,6 +281,65 @@ def _unlike_sensors(identified: Metrics) -> Iterator[str]:
     if share is not None and share > _LARGER_THAN_MEASURED and (of_weight or 0.0) > MAX_MASS_ERROR:
         ratio = f"base force: errors of {share:.2g} times what its measurements vary by"
         yield f"{ratio}; check frames, signs and units of contact forces and of the base's pose: torchid check"
+
+
+def _computed(judged: ErrorComparison) -> Iterator[str]:
+    """That the robot's file itself predicts the forces better than any file predicts those of a real robot."""
+    shares = [share for group in ERROR_GROUPS if (share := judged.nominal.relative_of(group)) is not None]
+    if shares and max(shares) < _COMPUTED:
+        to = f"to {format_percent(max(shares))} %"
+        yield f"the {judged.of} predicts these forces {to}: were they computed from it, or commanded, not measured?"
+
+
+def _heavy(run: Identification) -> Iterator[str]:
+    """Bodies beyond `_HEAVY` times their mass in the robot's file, which their own interval does not exclude."""
+    robot, estimate = run.experiment.robot, run.estimate
+    mass, error = (x.reshape(-1, PER_BODY)[:, 0] for x in (estimate.phi, estimate.standard_error))
+    nominal = robot.nominal[:, 0]
+    known = (estimate.verdict.reshape(-1, PER_BODY)[:, 0] == IDENTIFIED) & (mass - nominal > 2.0 * error)
+    heavy = np.flatnonzero((mass > _HEAVY * nominal) & (nominal > 0.0) & ~known)
+    ratio = mass[heavy] / nominal[heavy]
+    if named := [f"{robot.body_names[heavy[k]]} {ratio[k]:.2g} times" for k in np.argsort(-ratio)]:
+        why = f"which the data do not determine: an estimator.ridge above {run.experiment.config.estimator.ridge}"
+        yield f"{join_names(named, _FEW_NAMED)} the {robot.format}'s mass, {why}"
+
+
+def _driving(run: Identification) -> Iterator[str]:
+    """That Coulomb friction is negative far beyond its standard errors, which least squares lets it be."""
+    value, error = (x.reshape(-1, PER_BODY)[:, COULOMB] for x in (run.estimate.phi, run.estimate.standard_error))
+    bodies = np.array(run.experiment.robot.bodies, object)[value < -_CLEAR_ERRORS * error]
+    if len(bodies) and (run.misfit.share or 0.0) > _EXACT_SHARE:
+        names = join_names([body.joint.name for body in bodies], _FEW_NAMED)
+        yield f"friction drives {names}: its torque is reversed, or its friction of another shape: torchid check"
+
+
+def _implicit(run: Identification) -> Iterator[str]:
+    """That armatures are those which a simulator's implicit integration of a PD law adds, where its kd is stated."""
+    logs, robot = run.experiment.config.logs, run.experiment.robot
+    torque = logs.columns.joint_torque if logs.columns else None
+    if run.forces is None or torque is None or torque.pd is None or torque.pd.kd is None:
+        return
+    kd = values_by_name("logs.columns.joint_torque.pd.kd", torque.pd.kd.value, robot.joint_names)
+    known = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
+    found = {x.extra.name: x.value - known[x.extra.name] for x in run.extras if x.extra.what == "armature"}
+    if step := implicit_step(kd, found, float(np.median(np.diff(run.forces.time)))):
+        yield f"armatures are {1e3 * step:.2g} ms times the stated kd: no rotors, but a simulator's implicit PD law"
+
+
+def implicit_step(kd: Mapping[str, float], armatures: Mapping[str, float], step: float) -> float | None:
+    """The time [s] by which armatures [kg m^2] are the gains kd [N m s/rad] times it; None for a coincidence.
+
+    It is none where gains differ and armatures go with them, or where the time is the step of the samples.
+    Source: MuJoCo's integrators, (M + h kd) a = f for a damping of kd and a step of h.
+    """
+    gains = np.array([gain for name, gain in kd.items() if gain > 0.0 and name in armatures])
+    if not len(gains):
+        return None
+    times = np.array([armatures[name] / gain for name, gain in kd.items() if gain > 0.0 and name in armatures])
+    common = float(np.median(times))
+    alike = common > 0.0 and bool((np.abs(times / common - 1.0) < _ALIKE).all())
+    known = gains.max() > _DIFFERENT * gains.min() or abs(common / step - 1.0) < _SAME_STEP
+    return common if alike and known else None
 
 
 def _unlike_joints(run: Identification) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -311,6 +312,17 @@ def needs_these_torques(setup: RobotSetup) -> bool:
     except InputError:
         return False
     return is_near_nominal(gain)
+
+
+def lower_cutoff(setup: RobotSetup) -> CutoffChoice | None:
+    """The band that a fit predicts, None where it is not narrower than the one that is fitted, or not known."""
+    files, cutoff = setup.config.logs, setup.config.preprocessing.filter_hz
+    if files is None or files.compressed or cutoff is None:
+        return None
+    with suppress(InputError):
+        found = _cutoff(setup, _Trials(), CutoffChoice(cutoff, by_noise=False), _cutoff_of_motion(setup)[1])
+        return None if found.limit_hz is None else found
+    return None
 
 
 def is_near_nominal(gain: float | None) -> bool:

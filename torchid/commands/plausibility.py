@@ -12,7 +12,7 @@ from rich.progress import Progress, TaskID
 
 from torchid import parameters
 from torchid.commands.check import LogSegment, segments_to_check
-from torchid.commands.chosen_settings import is_near_nominal, needs_these_torques
+from torchid.commands.chosen_settings import is_near_nominal, lower_cutoff, needs_these_torques
 from torchid.commands.results import Identification
 from torchid.config import ExperimentConfig
 from torchid.config.logs import LogsConfig
@@ -90,8 +90,9 @@ class TrainingLogs:
         """
         if self.finding is None:
             if refused:
-                of = self.setup.robot.format
-                accepted = f"data and {of} that fit each other; usual reasons: {_USUAL.format(of=of)}"
+                of, lower = self.setup.robot.format, lower_cutoff(self.setup)
+                band = "" if lower is None else f"preprocessing.cutoff_hz={lower}; or "
+                accepted = f"{band}data and {of} that fit each other; usual reasons: {_USUAL.format(of=of)}"
                 raise ImplausibleFitError.at_field("logs", reason, _advice(accepted, self.setup))
             return ""
         log, finding = self.finding

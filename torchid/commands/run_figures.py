@@ -13,6 +13,8 @@ from torchid.commands.answer import answer
 from torchid.commands.training import body_eigenvalues, known_parameters
 from torchid.config import ExperimentConfig, dump_config
 from torchid.estimators import ConstrainedEstimate, SgdEstimate
+from torchid.identifiability.information import Contributions
+from torchid.logs.time_range import log_title
 from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
@@ -20,11 +22,13 @@ from torchid.problem.contact_state import IN_THE_AIR
 from torchid.problem.metrics import LOG_SETS
 from torchid.report.figure_style import draw_for
 from torchid.report.figures import (
+    contribution_figure,
     error_figure,
     extra_figure,
     identifiability_figure,
     inertia_figure,
     parameter_figure,
+    ridge_figure,
 )
 from torchid.report.forces import ForceSeries, force_figure, pressure_figure, rows_figure, spectrum_figure
 from torchid.report.tables import table_text, verdict_counts_table
@@ -53,8 +57,11 @@ def run_figures(run: Identification) -> Figures:
     figures["parameters"] = partial(parameter_figure, robot.body_names, robot.nominal, estimate, kinds, robot.format)
     figures["identifiability"] = partial(identifiability_figure, robot.body_names, estimate)
     figures["inertia"] = partial(inertia_figure, robot, estimate.phi.reshape(-1, PER_BODY))
+    figures["contributions"] = partial(contribution_figure, _bits(run.contributions))
     if run.extras:
         figures["extras"] = partial(extra_figure, run.extras)
+    if run.ridge is not None:
+        figures["ridge"] = partial(ridge_figure, run.ridge, robot.format)
     return figures
 
 
@@ -67,6 +74,15 @@ def force_figures(series: ForceSeries, robot: Robot) -> Figures:
         points = ForceSeries(series.source, series.time, *series.pressure)
         figures["pressure"] = partial(pressure_figure, points, robot.format)
     return figures
+
+
+def _bits(contributions: Contributions) -> dict[str, list[tuple[str, float]]]:
+    """Names and bits, by kind."""
+    return {
+        "logs": [(log_title(log.name), log.bits) for log in contributions.logs],
+        "contact states": [(state.name, state.bits) for state in contributions.states],
+        "sensors": [(sensor.name, sensor.bits) for sensor in contributions.sensors],
+    }
 
 
 def draw_figures(run: Identification, folder: Path) -> dict[str, bytes]:
@@ -94,6 +110,7 @@ def write_events(run: Identification, folder: Path, figures: Mapping[str, bytes]
     last = estimate.epochs if isinstance(estimate, SgdEstimate) else 1
     with RunEvents(folder) as events:
         if not descent:  # which has said before what there is to show
+            events.write_layout(robot.body_names)
             events.write_solution(estimate, None if run.factors else run.samples / run.seconds["compress"])
         for nominal, phi in ((True, robot.nominal.flatten()), (False, estimate.phi)):
             events.write_errors(last, _errors(run, nominal), nominal=nominal)

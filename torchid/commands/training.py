@@ -149,6 +149,9 @@ class Training:
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
         since = trainer.epoch + 1 if trainer.epoch else 0
         with self._interruptible(trainer), self._curves(since) as events:
+            if events is not None:
+                known = known_parameters(self.robot, trainer.closed_form, trainer.phi())
+                events.write_layout(self.robot.body_names, list(known))
             if trainer.epoch == 0:
                 self._evaluate(trainer, evaluate, events)
                 self._save(trainer, events)

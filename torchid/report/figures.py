@@ -1,8 +1,12 @@
-"""Figures of a run: of its parameters, its errors and its replay."""
+"""Figures of a run: of its parameters, how its ridge was chosen, its replay, and a robot's tree."""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
+from textwrap import fill
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,9 +23,10 @@ from torchid.errors import format_percent
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import FIXED, IDENTIFIED
 from torchid.fitting.calibration import Comparison
+from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.logs.time_range import log_title
-from torchid.parameters import INERTIAL, PARAMETERS, PER_BODY, Array
+from torchid.parameters import INERTIAL, PARAMETERS, PER_BODY, WRENCH_COMPONENTS, Array
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, group_name
 from torchid.report.figure_style import (
@@ -30,11 +35,14 @@ from torchid.report.figure_style import (
     MEASURED_COLOR,
     NOMINAL_COLOR,
     STYLE,
+    decade,
     decade_formatter,
     label_decades,
 )
 from torchid.report.tables import MARKS, marks_legend
 from torchid.robot import Robot
+from torchid.robot.tree import BodyJoint
+from torchid.sensing import Contact
 
 INTERVAL = 1.96
 """Standard errors on either side of a 95 % interval."""
@@ -187,6 +195,26 @@ def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str]
     axis.set_ylim(len(rows) - 0.5, -0.5)
     margin = _MARGIN * (max(*ends, 0.0) - min(*ends, 0.0))
     axis.set_xlim(min(*ends, 0.0) - margin, max(*ends, 0.0) + margin)
+    _leave_room(axis, extras, rows)
+
+
+def _leave_room(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str]) -> None:
+    """Cut the axis off where confounded values would leave those that are known no room; an arrow has what is cut."""
+    bars = [(x.value, INTERVAL * x.standard_error) for x in extras if x.separable and math.isfinite(x.standard_error)]
+    low, high = min((v - e for v, e in bars), default=0.0), max((v + e for v, e in bars), default=0.0)
+    low, high = min(low, 0.0), max(high, 0.0)
+    left, right = axis.get_xlim()
+    if not high > low or right - left <= _MAX_ERROR_RATIO * (high - low):
+        return
+    margin = 0.3 * (high - low)
+    axis.set_xlim(low - margin, high + margin)
+    for x in extras:
+        if not low - margin <= x.value <= high + margin:
+            left_side = x.value < low
+            text = f"◂ {x.value:.2g}" if left_side else f"{x.value:.2g} ▸"
+            place = 0.005 if left_side else 0.995, rows.index(x.extra.label)
+            where = axis.get_yaxis_transform()
+            axis.text(*place, text, transform=where, ha="left" if left_side else "right", va="bottom", fontsize=7)
 
 
 # ----------------------------------------------------------------------------------------------- ellipsoids of inertia
@@ -260,6 +288,13 @@ def equivalent_ellipsoid(phi: Array) -> tuple[Array, Array] | None:
 
 
 _FLOOR = "noise of the readings alone"
+_MOST_BARS = 20  # of a kind of contributions
+#: Colors of sensors and links in the tree, and its column width, row height and legend width [inches].
+_TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = IDENTIFIED_COLOR, "#009e73", "#cc79a7", "0.75", "0.3"
+_COLUMN, _ROW, _LEGEND = 2.1, 0.3, 7.4
+
+Position = tuple[float, int]
+"""Column and row in the figure of a tree."""
 
 
 # ---------------------------------------------------------------------------------------------------- errors
@@ -327,6 +362,223 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
     right.set_xlabel("number")
     right.set_ylabel("singular value [standard deviations per scale]")
     right.grid(visible=True)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]]) -> Figure:
+    """Bits lost without each log, contact state or sensor, by group: pairs of name and bits, the largest first.
+
+    Groups of one are left out if there are others.
+    """
+    several = {group: pairs for group, pairs in groups.items() if len(pairs) > 1}  # one alone has all that there is
+    shown = {
+        group: sorted(pairs, key=lambda pair: -pair[1])[:_MOST_BARS]
+        for group, pairs in (several or groups).items()
+        if pairs
+    }
+    counts = [len(pairs) for pairs in shown.values()]
+    figure = Figure(figsize=(9.0, 0.24 * sum(counts) + 0.6 * len(shown) + 0.6), layout="constrained")
+    axes = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[count + 0.8 for count in counts])[:, 0]
+    for axis, (group, pairs) in zip(axes, shown.items(), strict=True):
+        names, bits = zip(*pairs, strict=True)
+        bars = axis.barh(range(len(pairs)), bits, 0.7, color=IDENTIFIED_COLOR)
+        axis.bar_label(bars, fmt="%.3g", fontsize=8, padding=2)
+        axis.set_yticks(range(len(pairs)), [fill(name, 60) for name in names], fontsize=7)
+        axis.set_ylim(len(pairs) - 0.4, -0.6)
+        axis.grid(visible=False, axis="y")
+        hidden = len(groups[group]) - len(pairs)
+        axis.set_title(group + (f", {hidden} more not shown" if hidden else ""), loc="left", fontsize=9)
+    axes[-1].set_xlabel("information lost without it [bits]")
+    return figure
+
+
+# ------------------------------------------------------------------------------------- tree of a robot with its sensors
+
+
+@matplotlib.rc_context(STYLE | {"axes.grid": False})
+def tree_figure(
+    title: str,
+    robot: Robot,
+    contacts: Sequence[Contact],
+    measured: Collection[str],
+    wrenches: Mapping[str, Sequence[str]],
+    constrained: Collection[str],
+) -> Figure:
+    """The tree from the base downward, one column per limb.
+
+    Args:
+        title: of the figure.
+        robot: the robot.
+        contacts: those of the scenario.
+        measured: names of measured readings, of the robot's `dof_names`.
+        wrenches: measured components by contact frame.
+        constrained: joints between the base and a contact.
+    """
+    constrained = {*constrained, *_loaded_welds(robot, contacts)}
+    positions = _body_positions(robot, contacts)
+    contact_positions = _contact_positions(robot, contacts, positions)
+    right = max(x for x, _ in positions)
+    deepest = max(y for _, y in [*positions, *contact_positions.values()])
+    size = max(_COLUMN * (right + 1.0), _LEGEND) + 0.2, _ROW * (deepest + 1) + 1.3
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots()
+    for body, link in enumerate(robot.bodies):
+        if link.joint is not None:
+            _draw_joint(axes, link.joint, positions[link.parent], positions[body], measured, constrained)
+    for contact in contacts:
+        body, _ = robot.link(contact.frame)
+        position = contact_positions[contact.frame]
+        _draw_contact(axes, contact, positions[body], position, wrenches.get(contact.frame, ()))
+    axes.plot(*positions[0], "s", color="black", markersize=9)
+    _label(axes, robot.body_names[0], positions[0], fontsize=8)
+    axes.set(xlim=(-0.15, right + 0.95), ylim=(deepest + 0.6, -0.6))
+    axes.axis("off")
+    figure.suptitle(title, x=0.01, ha="left")
+    figure.legend(handles=_tree_legend(bool(robot.ft_names)), loc="outside lower left", ncols=5, fontsize=7.5)
+    return figure
+
+
+def _loaded_welds(robot: Robot, contacts: Sequence[Contact]) -> set[str]:
+    """Fixed joints that can carry a sensor, between the base and a contact."""
+    welds = set()
+    for contact in contacts:
+        body, _ = robot.link(contact.frame)
+        while (joint := robot.bodies[body].joint) is not None:
+            welds |= {joint.name} & set(robot.ft_names)
+            body = joint.parent
+    return welds
+
+
+def _body_positions(robot: Robot, contacts: Sequence[Contact]) -> list[Position]:
+    """Position of every body: leaves side by side, other bodies above their contacts, centred over their children."""
+    contact_count = Counter(robot.link(contact.frame)[0] for contact in contacts)
+    children, row = robot.children, [0] * len(robot.bodies)
+    for body, link in enumerate(robot.bodies[1:], start=1):
+        row[body] = row[link.parent] + 1 + contact_count[link.parent]
+    column, free = [0.0] * len(robot.bodies), 0
+    for body in reversed(range(len(robot.bodies))):  # children come after their parents
+        if children[body]:
+            column[body] = 0.5 * (column[children[body][0]] + column[children[body][-1]])
+        else:
+            column[body], free = float(free), free + 1
+    return [(max(column) - x, y) for x, y in zip(column, row, strict=True)]
+
+
+def _contact_positions(robot: Robot, contacts: Sequence[Contact], bodies: Sequence[Position]) -> dict[str, Position]:
+    """Positions of contacts, one below the other under their body."""
+    positions: dict[str, Position] = {}
+    count: Counter[int] = Counter()
+    for contact in contacts:
+        body, _ = robot.link(contact.frame)
+        count[body] += 1
+        column, row = bodies[body]
+        positions[contact.frame] = (column, row + count[body])
+    return positions
+
+
+def _draw_joint(
+    axes: Axes,
+    joint: BodyJoint,
+    parent: Position,
+    position: Position,
+    readings: Collection[str],
+    constrained: Collection[str],
+) -> None:
+    name = joint.name if joint.mimic is None else joint.mimic.master
+    weld = [k for k in WRENCH_COMPONENTS if f"{name}.{k}" in readings] if joint.kind == "fixed" else []
+    loaded, measured = name in constrained, bool(weld) or name in readings
+    (x, y), bend = position, parent[1] + 0.5
+    style: dict[str, Any] = {"color": _LOADED if loaded else _PLAIN, "linewidth": 2.2 if loaded else 1.4, "zorder": 0}
+    axes.plot([parent[0], parent[0], x, x], [parent[1], bend, bend, y], **style)
+    color, part = _LIMB if weld else _TORQUE, 0 < len(weld) < len(WRENCH_COMPONENTS)
+    face = color if measured else "white"
+    style = {"color": color if measured else "0.5", "markerfacecolor": face, "fillstyle": "left" if part else "full"}
+    axes.plot(x, y, "h" if joint.kind == "fixed" else "o", markersize=8 if joint.kind == "fixed" else 7, **style)
+    label = joint.name if joint.mimic is None else f"{joint.name} (follows)"
+    label += f": {', '.join(weld)}" if part else ""
+    _label(axes, label, position, measured, fontsize=6.5, color="black" if measured or loaded else "0.45")
+
+
+def _label(axes: Axes, text: str, position: Position, bold: bool = False, **style: Any) -> None:
+    weight = "bold" if bold else "normal"
+    axes.annotate(text, position, (8, 0), textcoords="offset points", va="center", fontweight=weight, **style)
+
+
+def _draw_contact(axes: Axes, contact: Contact, body: Position, position: Position, measured: Sequence[str]) -> None:
+    axes.plot([position[0], position[0]], [body[1], position[1]], color=_LOADED, linewidth=2.2, zorder=0)
+    part = bool(measured) and not set(measured) >= set(contact.component_names)
+    color, face = (_WRENCH, _WRENCH) if measured else ("0.5", "white")
+    axes.plot(*position, "D", color=color, markerfacecolor=face, fillstyle="left" if part else "full", markersize=8)
+    components = f": {', '.join(measured)}" if part else ""
+    _label(axes, f"{contact.frame} ({contact.kind}){components}", position, bool(measured), fontsize=7)
+
+
+def _tree_legend(welds: bool) -> list[Line2D]:
+    def marker(shape: str, color: str, face: str, label: str) -> Line2D:
+        return Line2D([], [], marker=shape, color=color, markerfacecolor=face, linestyle="none", label=label)
+
+    in_limbs = [marker("h", _LIMB, _LIMB, "sensor in a limb"), marker("h", "0.5", "white", "weld without")]
+    return [
+        marker("o", _TORQUE, _TORQUE, "joint torque measured"),
+        marker("o", "0.5", "white", "not measured"),
+        marker("D", _WRENCH, _WRENCH, "contact sensor"),
+        marker("D", "0.5", "white", "contact without"),
+        Line2D([], [], color=_LOADED, linewidth=2.2, label="constrained by contacts"),
+        *(in_limbs if welds else []),
+    ]
+
+
+# ---------------------------------------------------------------------------------------------------- ridge
+
+_WIDE_RATIO = 5.0  # ratio of errors from which on decades tell more than differences
+
+
+@matplotlib.rc_context(STYLE)
+def ridge_figure(choice: RidgeChoice, of: str = "URDF") -> Figure:
+    """Mean square of whitened residuals on held-out folds by ridge, on logarithmic axes.
+
+    The band is a standard error of the difference from the least, fold by fold, on either side; ridges where it reaches
+    down to the least are shaded: the data hardly tell them from the chosen one. Ridges of 0 have no place on the axis.
+    """
+    tried, mean, error = (np.array(x) for x in (choice.tried, choice.mean_square, choice.standard_error))
+    least = float(mean.min())
+    within = (mean - error <= least) & (tried > 0.0)
+    shown = tried > 0.0
+    figure = Figure(figsize=(6.4, 3.8), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xscale("log")
+    if mean.max() > _WIDE_RATIO * max(least, np.finfo(float).tiny):
+        axes.set_yscale("log")
+    low = mean - error if axes.get_yscale() == "linear" else np.maximum(mean - error, 0.5 * least)
+    band = axes.fill_between(
+        tried[shown], low[shown], (mean + error)[shown], color=IDENTIFIED_COLOR, alpha=0.25, linewidth=0
+    )
+    (curve,) = axes.plot(tried[shown], mean[shown], "o-", color=IDENTIFIED_COLOR, markersize=4)
+    line = axes.axhline(least, color="0.3", linewidth=1.0, linestyle="--")
+    handles = [curve, band, line]
+    labels = ["held-out folds", "± a standard error of the difference from the least", f"least: {least:.4g}"]
+    if within.any():
+        edge = np.sqrt(10.0)
+        handles.append(
+            axes.axvspan(tried[within].min() / edge, tried[within].max() * edge, color="0.9", zorder=0, linewidth=0)
+        )
+        labels.append("within a standard error of the least")
+    if choice.ridge > 0.0:
+        at = float(mean[list(choice.tried).index(choice.ridge)])
+        (marker,) = axes.plot(choice.ridge, at, "D", color=NOMINAL_COLOR, markersize=8, markerfacecolor="none")
+        handles.append(marker)
+        what = "chosen" if choice.rule == "auto" else "chosen, the largest of these"
+        labels.append(f"{what}: {choice.ridge:g}, {at:.4g}")
+    axes.set_xticks(tried[shown], [decade(ridge) for ridge in tried[shown]])
+    axes.minorticks_off()
+    if axes.get_yscale() == "log":
+        label_decades(axes.yaxis)
+    axes.set_xlim(tried[shown].min() / 2.0, tried[shown].max() * 2.0)
+    axes.set_xlabel(f"ridge: weight of the {of} against the mean square of the rows [1]")
+    axes.set_ylabel("mean square of whitened residuals\non held-out folds [noise²]")
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8)
+    figure.suptitle("Ridge by cross-validation", x=0.01, ha="left")
     return figure
 
 

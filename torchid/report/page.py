@@ -25,6 +25,8 @@ FIGURES = {
     "identifiability": "share of the data in each parameter",
     "inertia": "ellipsoids of inertia from two sides",
     "extras": "offsets, scales and terms of actuators",
+    "contributions": "information lost without each log, contact state and sensor",
+    "ridge": "error on held-out blocks by ridge",
 }
 """What the figures of a run show, by name."""
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -14,12 +15,14 @@ from torch.utils.tensorboard.summary import hparams
 from torchid.estimators import ConstrainedEstimate, Epoch, Estimate
 from torchid.identifiability.information import InformationGain
 from torchid.problem import Metrics
-from torchid.problem.metrics import ERROR_GROUPS
+from torchid.problem.metrics import ERROR_GROUPS, LOG_SETS, ROW_GROUPS
 from torchid.report.figures import INTERVAL
 
 _RGBA = 4  # colour space in Summary.Image
 _NOMINAL = "_nominal"  # ends the names of charts of the nominal parameters
 _BY_EPOCH = "training_"  # begins those of curves
+_CHARTED = ("test", "left_out", "train")
+_TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
 _BOUNDS = ("_lower", "_upper")  # ends the names of charts of the ends of intervals
 
 
@@ -34,6 +37,34 @@ class RunEvents:
     def __init__(self, folder: Path, since: int | None = None) -> None:
         """Open a new event file; `since`: first step of earlier event files in the folder that is overwritten."""
         self._writer = SummaryWriter(str(folder), purge_step=since)
+
+    def write_layout(self, bodies: Sequence[str], by_epoch: Sequence[str] | None = None) -> None:
+        """Say what *Custom scalars* shows, once for a run.
+
+        Args:
+            bodies: names of the bodies; none where losses are all that is written.
+            by_epoch: of a descent, names of the parameters whose intervals are drawn.
+        """
+        layout: dict[str, dict[str, list[str | list[str]]]] = {}
+        if bodies:
+            tags = [f"error_relative_{name}{kind}" for name in _CHARTED for kind in (_NOMINAL, "")]
+            layout["errors, share of measured"] = _charts(tags, ERROR_GROUPS)
+        if bodies and by_epoch is not None:
+            tags = [f"{_BY_EPOCH}error_relative_{name}" for name in LOG_SETS]
+            layout["errors by epoch, share of measured"] = _charts(tags, ROW_GROUPS)
+        if by_epoch is not None:
+            losses = [f"loss{of}/data$" for of in ("", "_held_out", "_unseen")]
+            terms = [f"loss/{term}" for term in _TERMS]
+            layout["loss by epoch"] = {"train, held out, unseen": ["Multiline", losses], "terms": ["Multiline", terms]}
+        if bodies:
+            least = [f"smallest_eigenvalue/{re.escape(name)}$" for name in bodies]
+            layout["bodies"] = {"smallest eigenvalue": ["Multiline", least]}
+        if by_epoch:
+            tag = f"{_BY_EPOCH}parameter"
+            layout["parameters by epoch, 95 % intervals"] = {
+                name: ["Margin", [f"{tag}{kind}/{name}" for kind in ("", *_BOUNDS)]] for name in by_epoch
+            }
+        self._writer.add_custom_scalars(layout)
 
     def __enter__(self) -> RunEvents:
         return self
@@ -157,6 +188,11 @@ class RunEvents:
             self._writer.file_writer.add_summary(summary)
         for tag, value in named.items():
             self._writer.add_scalar(tag, value, step)
+
+
+def _charts(tags: Sequence[str], groups: Iterable[str]) -> dict[str, list[str | list[str]]]:
+    """A chart of all of these for each group of rows."""
+    return {group: ["Multiline", [f"{tag}/{group}" for tag in tags]] for group in groups}
 
 
 def _preformatted(text: str) -> str:
