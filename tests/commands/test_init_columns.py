@@ -24,7 +24,6 @@ from torchid.config import load_config
 from torchid.errors import LogError
 from torchid.logs import Log, read_log
 from torchid.logs.units import UNITS
-from torchid.robot import load_robot
 
 TIAGO = ROBOTS / "tiago_description/robots/tiago_no_hand.urdf"
 CASES = ROOT.parent / "shared" / "cases"
@@ -334,6 +333,41 @@ def test_seconds_and_nanoseconds_in_two_columns_are_one_stamp(tmp_path: Path) ->
     assert map_in(text)["time"] == {"column": "header.stamp.sec", "nanoseconds": "header.stamp.nanosec"}
 
 
+def test_without_stamps_the_step_is_that_by_which_velocities_are_slopes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = recorded()
+    columns = by_name(log)
+    del columns["t"]
+    found, said, text = initiated(save_csv(tmp_path / "x.csv", columns))
+    assert map_in(text)["time"] == {"step": 10.0, "unit": "ms"}
+    np.testing.assert_allclose(found.time, log.time - log.time[0], atol=1e-9)
+    assert any(line.startswith("time: by the slopes of positions") for line in said.assumed)
+    columns = {name: x for name, x in columns.items() if not name.startswith("dq")}
+    init(URDF, save_csv(tmp_path / "y.csv", columns), tmp_path / "y.yaml")
+    message = refusal(["identify", str(tmp_path / "y.yaml")], tmp_path, capsys)
+    assert "logs.columns.time.step: found 'FILL_IN'; accepted: a number" in message
+
+
+@pytest.mark.parametrize("counted", [False, True], ids=["numbers alone", "a line that counts the columns"])
+def test_columns_without_names_are_known_by_their_place_and_slopes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], counted: bool
+) -> None:
+    log = recorded()
+    columns = {str(k): x for k, x in enumerate(by_name(log).values())}
+    path = save_csv(tmp_path / "x.csv", columns)
+    path.write_text(path.read_text() if counted else path.read_text().partition("\n")[2])
+    assert "37 of numbers without a line of names" in refusal(["check", str(path)], tmp_path, capsys)
+    init(URDF, path, tmp_path / "x.yaml")
+    text = (tmp_path / "x.yaml").read_text()
+    assert map_in(text)["time"] == "column_0"
+    assert map_in(text)["joint_velocity"] == {"column": "column_{index}", "first_index": 13}
+    assert "    #   column_25: " in text
+    torque = "joint_torque: {column: 'column_{index}', first_index: 25}"
+    (tmp_path / "x.yaml").write_text(text.replace("joint_torque: FILL_IN", torque))
+    assert_recorded(read_log(path, columns=load_config(tmp_path / "x.yaml").logs.columns), log)
+
+
 def test_two_files_with_clocks_of_their_own_are_one_log(tmp_path: Path) -> None:
     log = recorded()
     columns = by_name(log)
@@ -362,20 +396,15 @@ def test_arrays_with_clocks_of_their_own_have_other_times(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("name", ["part_of_robot", "no_stamps", "bag_other_names", "no_header"])
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-def test_logs_of_strangers_need_no_edit_or_few(tmp_path: Path, name: str) -> None:
+def test_logs_of_strangers_need_no_edit_or_one(tmp_path: Path, name: str) -> None:
     if not CASES.is_dir():
         pytest.skip("logs of strangers are not beside the repository")
     log = CASES / name / ("log" if name == "bag_other_names" else "arm.csv")
     init(CASES / name / "arm.urdf", log, tmp_path / "a.yaml")
     text = (tmp_path / "a.yaml").read_text()
-    for key, block in {
-        "time: {step: FILL_IN, unit: ms}": "time: column_0" if name == "no_header" else "time: {step: 5, unit: ms}",
-        "joint_position: FILL_IN": "joint_position: {column: 'column_{index}', first_index: 1}\n    joint_order: [%s]",
-        "joint_torque: FILL_IN": "joint_torque: {column: 'column_{index}', first_index: 7}",
-    }.items():
-        joints = ", ".join(load_robot(CASES / name / "arm.urdf", fixed_base=True).joint_names)
-        text = text.replace(key, block % joints if "%s" in block else block)
-    (tmp_path / "a.yaml").write_text(text)
+    block = "joint_torque: {column: 'column_{index}', first_index: 7}"
+    (tmp_path / "a.yaml").write_text(text.replace("joint_torque: FILL_IN", block))
+    assert ("FILL_IN\n" in text) is (name == "no_header")
     assert main(["identify", str(tmp_path / "a.yaml"), "--quiet", f"output={tmp_path / 'run'}"]) == 0
     bodies = json.loads((tmp_path / "run" / "parameters.json").read_text())["bodies"]
     for body in bodies[1:] if name == "part_of_robot" else ():

@@ -6,7 +6,7 @@ import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress
+from itertools import compress, permutations
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from torchid.proposals.names import (
     within,
     words_of,
 )
-from torchid.proposals.samples import FileSample, increases, numbers_of, stated_names
+from torchid.proposals.samples import FileSample, increases, numbers_of, slope_fit, stated_names
 
 _AXIS = re.compile(r"(?:(?<![A-Za-z])[a-z]?([wxyz])|(?:(?<![A-Za-z])[A-Z]?|(?<=[a-z]))([WXYZ]))(?![A-Za-z0-9])")
 _LAST_NUMBER = re.compile(r"\d+(?!.*\d)")
@@ -48,6 +48,7 @@ TOUCH_WEIGHT = 0.05
 
 _TURN = 7.0  # [rad]: beyond this, angles are in degrees
 _STEPS_S = (2e-4, 0.2)  # between samples of recordings
+_MIN_CORRELATION = 0.9  # of velocities with slopes of positions
 
 
 @dataclass(frozen=True)
@@ -219,10 +220,13 @@ class _Proposer:
         self.stated = stated if set(stated) <= set(robot.joints) else []
 
     def propose(self) -> MapProposal:
-        self._place_joints()
-        self._place_base()
-        self._place_contacts()
-        self._place_law()
+        if all(re.fullmatch(r"column_\d+", name) for name in self.sample):
+            self._place_unnamed()
+        else:
+            self._place_joints()
+            self._place_base()
+            self._place_contacts()
+            self._place_law()
         self._place_time()
         self._settle_units()
         self._ask()
@@ -511,7 +515,7 @@ class _Proposer:
             self.out.assumed[key] = f"{fitting[0]}, from steps of {step:.3g}"
 
     def _place_step(self) -> None:
-        """Stamps by the step that the file states."""
+        """Stamps by the step that the file states, or by which velocities are the slopes of positions."""
         for name, values in self.sample.items():
             is_step = re.fullmatch(r"(\w+_)?(dt|time_?step)(_s)?", name, re.IGNORECASE) is not None
             if is_step and values is not None and values.dtype.kind in "fiu" and values.size:
@@ -520,6 +524,39 @@ class _Proposer:
                     self.out.columns["time"] = {"step": step}
                     self.out.assumed["time"] = f"steps of '{name}' [s], as nothing has stamps"
                     return
+        position, velocity = (self._values(x) for x in ("joint_position", "joint_velocity"))
+        if position is None or velocity is None or position.shape != velocity.shape:
+            return
+        correlation, step = slope_fit(position, velocity)
+        if correlation > _MIN_CORRELATION and _STEPS_S[0] <= step <= _STEPS_S[1]:
+            self.out.columns["time"] = {"step": float(f"{1e3 * step:.2g}"), "unit": "ms"}
+            self.out.assumed["time"] = "by the slopes of positions, which velocities are: nothing has stamps"
+
+    # ------------------------------------------------------------------------------------------------ columns by number
+
+    def _place_unnamed(self) -> None:
+        """Columns without names: stamps that increase, then positions and velocities of all joints, by slopes."""
+        count, names = len(self.robot.joints), list(self.foreign)
+        values = numbers_of(self.sample, names)
+        stamps = np.array([increases(column) for column in values.T])
+        self.families = [
+            Family(name, (name,), "", (), (), (), ("time",) * is_stamp, ("",), ())
+            for name, is_stamp in zip(names, stamps.tolist(), strict=True)
+        ]
+        moves = (np.ptp(values, axis=0) > 0.0) & ~stamps
+        starts = [k for k in range(len(names) - count + 1) if count and moves[k : k + count].all()]
+        for first, second in permutations(starts, 2):
+            pairs = zip(values.T[first : first + count], values.T[second : second + count], strict=True)
+            if abs(second - first) < count or min(slope_fit(*pair)[0] for pair in pairs) < _MIN_CORRELATION:
+                continue
+            for name, start in (("joint_position", first), ("joint_velocity", second)):
+                numbers = tuple(range(start, start + count))
+                columns = tuple(names[start : start + count])
+                block = Family("column_{index}", columns, "", (), numbers, (), (), ("",) * count, ())
+                self._add(name, block, block.entry)
+                self.out.assumed[name] = f"columns {start} to {numbers[-1]}, as velocities are slopes of positions"
+            self._add_order("joint", block)
+            return
 
     # ------------------------------------------------------------------------------------------------------------ units
 

@@ -78,6 +78,19 @@ def increases(values: NDArray[Any] | None, strictly: bool = True) -> bool:
     return bool((steps > 0).mean() > _SORTED if strictly else (steps >= 0).mean() > _SORTED and (steps > 0).any())
 
 
+def slope_fit(position: NDArray[Any], velocity: NDArray[Any]) -> tuple[float, float]:
+    """Correlation of velocities (N, ...) with steps of positions, and the time between samples."""
+    steps = np.diff(position.astype(float), axis=0)
+    mean = 0.5 * (velocity[1:] + velocity[:-1]).astype(float)
+    with np.errstate(all="ignore"):
+        product = np.nansum(steps * mean)
+        step_power = np.nansum(steps**2)
+        mean_power = np.nansum(mean**2 + 0.0 * steps)
+    if not step_power > 0.0 or not mean_power > 0.0:
+        return 0.0, 0.0
+    return float(product / np.sqrt(step_power * mean_power)), float(product / mean_power)
+
+
 def with_samples_first(sample: FileSample) -> tuple[FileSample, str]:
     """Arrays with a row for each sample, those that were transposed for it by the name `NAME.T`; and a note.
 
