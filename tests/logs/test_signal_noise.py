@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from torchid.errors import TorchidWarning
 from torchid.logs import Log
+from torchid.logs.log import SignalNoise
 from torchid.logs.preprocess import make_timeline, preprocess
-from torchid.logs.signal_noise import SignalNoise, signal_noise, white_noise
+from torchid.logs.signal_noise import signal_noise, white_noise
 
 RATE, COUNT = 500.0, 20_000
 TIME = np.arange(COUNT) / RATE

@@ -16,9 +16,8 @@ from torchid.errors import TorchidWarning, join_names
 from torchid.log_checks.findings import REJECTED, SUSPICIOUS, Finding, Skipped, median_step
 from torchid.logs import Log
 from torchid.logs.cutoff import usual_cutoff_hz
-from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.log import BoolArray, FloatArray, SignalNoise
 from torchid.logs.preprocess import preprocess
-from torchid.logs.signal_noise import SignalNoise
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
 from torchid.problem.extras import list_extras
 from torchid.problem.metrics import force_series, null_space_part

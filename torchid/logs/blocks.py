@@ -19,7 +19,7 @@ from torchid.logs.columns import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.force_plates import about_world_origin
 from torchid.logs.gaps import bridge_gaps
-from torchid.logs.lazy_arrays import LazyArray, MappedArray, Spill
+from torchid.logs.lazy_arrays import LazyArray, Spill
 from torchid.logs.log import (
     NAME_FIELDS,
     SHAPES,
@@ -31,7 +31,7 @@ from torchid.logs.log import (
     to_float64,
 )
 from torchid.logs.read import build_log, check_fields_given
-from torchid.logs.schema import match_arrays
+from torchid.logs.schema import FileFields, match_arrays
 from torchid.logs.table_files import is_text_table
 from torchid.logs.tables import read_table, table_blocks, table_size
 from torchid.logs.time_range import split_range
@@ -40,6 +40,37 @@ GIGABYTE = 1e9
 _WHOLE = "a larger preprocessing.memory_gb, or the file that torchid convert makes of it"
 _ACCEPTED = "a plain array of numbers, truth values or text"
 _BYTES_PER_LETTER = 4  # of a table: a cell has at least two characters, a number eight bytes
+
+
+class MappedArray:
+    """A field whose arrays are read where it is sliced."""
+
+    def __init__(self, fields: FileFields, name: str, arrays: Mapping[str, LazyArray]) -> None:
+        """The field of a name, of open arrays. Raises LogError: arrays that do not fit it."""
+        self._fields, self._name, self._arrays = fields, name, arrays
+        self._constant = fields.constant_sources(name)
+        for source in fields.sources_of(name):
+            if not arrays[source].shape:
+                raise LogError.at_field(f"'{source}'", "a single value", "an array with a row for each sample")
+        sampled = [source for source in fields.sources_of(name) if not self._is_constant(source)]
+        lengths = {source: arrays[source].shape[0] for source in sampled}
+        for source, length in lengths.items():
+            if length != max(lengths.values()):
+                raise LogError.at_field(f"'{source}'", f"{length} samples", f"{max(lengths.values())}, as others have")
+        first = self[slice(0, 1)]
+        self.dtype, self.shape = first.dtype, (max(lengths.values(), default=0), *first.shape[1:])
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        if self._name == "time" and self._fields.step is not None and hasattr(self, "shape"):
+            start, stop, _ = rows.indices(self.shape[0])
+            return self._fields.stamps(start, stop - start)
+        return self._fields.value(self._name, lambda source: self._read(source, rows))
+
+    def _read(self, source: str, rows: slice) -> NDArray[Any]:
+        return np.asarray(self._arrays[source][slice(None) if self._is_constant(source) else rows])
+
+    def _is_constant(self, source: str) -> bool:
+        return source in self._constant and len(self._arrays[source].shape) == 1
 
 
 def log_bytes(path: Path, limit: float) -> int:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchid.errors import LogError
-from torchid.logs.log import FloatArray, Log
+from torchid.logs.log import FloatArray, Log, SignalNoise
 from torchid.logs.low_pass import import_signal
 from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.quaternion import make_sign_continuous
-from torchid.logs.signal_noise import STATED_FIELDS, SignalNoise, signal_noise
+from torchid.logs.signal_noise import STATED_FIELDS, signal_noise
 from torchid.logs.timeline import LONGEST_MEDIAN_STEP, spline_derivatives
 from torchid.parameters import GRAVITY
 

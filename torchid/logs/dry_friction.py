@@ -16,9 +16,9 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 
 from torchid.errors import about_file, warn_about_file
-from torchid.logs.log import BoolArray, FloatArray, Log
+from torchid.logs.log import BoolArray, FloatArray, Log, SignalNoise
 from torchid.logs.low_pass import LowPass, import_signal
-from torchid.logs.signal_noise import MOST_SAMPLES, SignalNoise, noise_of_derivatives, rough_noise
+from torchid.logs.signal_noise import MOST_SAMPLES, noise_of_derivatives, rough_noise
 from torchid.logs.timeline import JITTER, Timeline, spline_derivatives
 
 #: Values that are filtered together: few, so that copies of a long log are small; many, so that a short one needs few

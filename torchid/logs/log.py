@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, UnknownNameError, about_file
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.reprs import short_repr
-
-if TYPE_CHECKING:
-    from torchid.logs.signal_noise import SignalNoise
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -88,6 +85,26 @@ REQUIRED_WITH: dict[str, tuple[str, ...]] = {
 
 #: Pairs with the same content: a file may have only one of each.
 EXCLUSIVE = (*VARIANTS.items(), WRENCHES)
+
+
+@dataclass(frozen=True)
+class SignalNoise:
+    """White noise of the recorded motion of a log, in every sample.
+
+    Attributes:
+        std: standard deviation of each channel of the recorded fields, (c,), 0 where it shows none; of the orientation
+            along the base's axes, (3,) [rad].
+        derivatives: (3, 3), covariance of a preprocessed channel of unit noise [1] and its first two derivatives [1/s,
+            1/s^2] where they are derived from it.
+    """
+
+    std: Mapping[str, FloatArray]
+    derivatives: FloatArray = field(default_factory=lambda: np.diag([1.0, 0.0, 0.0]))
+
+    @property
+    def found(self) -> bool:
+        """Whether there is any."""
+        return any(bool(x.any()) for x in self.std.values())
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from math import comb
 
 import numpy as np
 
 from torchid.errors import join_names, warn_about_file
-from torchid.logs.log import FloatArray, Log, column_labels
+from torchid.logs.log import FloatArray, Log, SignalNoise, column_labels
 from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.timeline import JITTER, SPLINE_OVERLAP, Timeline, spline_derivatives
 from torchid.rounding import MAD_PER_STD
@@ -48,26 +47,6 @@ _LARGEST = 0.02  # [rad, m] noise of joint positions; beyond, successive samples
 # nobody's readings: what looks like noise in them is as often motion, such as the trembling of contacts
 _DERIVED = ("joint_acceleration", "base_angular_acceleration_base", "imu_angular_acceleration")
 _ORIENTATION = "base_quat_xyzw"
-
-
-@dataclass(frozen=True)
-class SignalNoise:
-    """White noise of the recorded motion of a log, in every sample.
-
-    Attributes:
-        std: standard deviation of each channel of the recorded fields, (c,), 0 where it shows none; of the orientation
-            along the base's axes, (3,) [rad].
-        derivatives: (3, 3), covariance of a preprocessed channel of unit noise [1] and its first two derivatives [1/s,
-            1/s^2] where they are derived from it.
-    """
-
-    std: Mapping[str, FloatArray]
-    derivatives: FloatArray = field(default_factory=lambda: np.diag([1.0, 0.0, 0.0]))
-
-    @property
-    def found(self) -> bool:
-        """Whether there is any."""
-        return any(bool(x.any()) for x in self.std.values())
 
 
 def signal_noise(log: Log, timeline: Timeline | None, stated: Mapping[str, float] | None = None) -> SignalNoise:

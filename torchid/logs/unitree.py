@@ -1,4 +1,4 @@
-"""Robots of Unitree: the orders in which they number motors and feet, and their LowState messages with a decoder.
+"""Robots of Unitree: the orders in which they number motors and feet, and the definitions of their LowState messages.
 
 Numbers are those of `motor_state` in the robots' own messages, names those of their URDFs. Sources: the enumerations of
 joints in the examples of unitree_sdk2 (`go2`, `b2`, `h1`, `g1`) and unitree_legged_sdk (`a1`, `go1`), and the URDFs of
@@ -14,15 +14,10 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from torchid.errors import ConfigError, LogError
-from torchid.logs.quaternion import require_unit
+from torchid.errors import ConfigError
 
 if TYPE_CHECKING:
-    from torchid.logs.log import FloatArray
-    from torchid.logs.ros_topics import LowStateTopic
+    pass
 
 
 GO, HG = "unitree_go/msg/LowState", "unitree_hg/msg/LowState"
@@ -159,112 +154,3 @@ DEFINITIONS: dict[str, str] = {
 def register(store: Any, parse: Any) -> None:
     """Add the types to a typestore of rosbags; `parse`: `rosbags.typesys.get_types_from_msg`."""
     store.register({key: value for name, text in DEFINITIONS.items() for key, value in parse(text, name).items()})
-
-
-_KEY = "logs.topics.low_state"
-#: Ticks may be off the times of receipt by this [ns], and by this share of the log: a network stalls, a clock drifts.
-_OFF, _OFF_SHARE = 100_000_000, 0.01
-_MILLISECOND, _WRAP = 1_000_000, 1 << 32
-
-
-class LowState:
-    """`unitree_go/LowState` or `unitree_hg/LowState`; the accelerometer reads a specific force, +g upwards at rest."""
-
-    types: tuple[str, ...] = tuple(MOTORS)
-
-    def __init__(self, topic: LowStateTopic) -> None:
-        """For the messages of a topic, with the motors of a robot or as they are listed."""
-        self._topic, self._settings = topic.topic, topic
-        self._order = list(topic.order)
-        self.names = tuple(name for name in self._order if name is not None)
-
-    def check_options(self, field: str, kind: str) -> None:
-        """Refuse settings, of a field, that messages of a type do not fit.
-
-        Raises:
-            LogError: the robot has another type, there are fewer motors than joints, or no foot sensors.
-        """
-        robot, name = JOINT_ORDERS.get(self._settings.robot or ""), self._settings.robot
-        if robot is not None and robot.message != kind:
-            others = ", ".join(x for x, order in JOINT_ORDERS.items() if order.message == kind)
-            found = f"'{name}', which sends {robot.message}, though {self._topic} carries {kind}"
-            raise LogError.at_field(f"{field}.robot", found, others)
-        if len(self._order) > MOTORS[kind]:
-            found = f"{len(self._order)} names, though {kind} has {MOTORS[kind]} motors"
-            raise LogError.at_field(f"{field}.joints", found, "at most that many, by number of the motor")
-        if self._settings.reads_feet and kind != GO:
-            key = "forces" if self._settings.forces else "above"
-            raise LogError.at_field(f"{field}.{key}", f"set, though {kind} has no foot sensors", f"no {key}")
-
-    def row(self, message: Any) -> FloatArray:
-        """Position, velocity and torque of every motor, specific force, angular velocity, quaternion, foot sensors.
-
-        Raises:
-            LogError: ankles and waist by motor rather than by joint.
-        """
-        if getattr(message, "mode_pr", 0):
-            found = f"mode_pr {message.mode_pr}: ankles and waist by their parallel motors (A, B), not by joint"
-            raise LogError.at_field(self._topic, found, "messages with mode_pr 0: pitch and roll")
-        motors, imu = message.motor_state, message.imu_state
-        values = [*(x.q for x in motors), *(x.dq for x in motors), *(x.tau_est for x in motors)]
-        arrays = imu.accelerometer, imu.gyroscope, imu.quaternion, getattr(message, "foot_force", np.array([]))
-        return np.array([*values, *(x for array in arrays for x in array.tolist())], dtype=np.float64)
-
-    def fields(self, rows: FloatArray, kind: str) -> dict[str, FloatArray]:
-        """Fields (N, n) of the joints, (N, 3) and (N, 4) of the IMU, and the raw readings of feet (N, 4), if any.
-
-        Raises:
-            LogError: quaternions of no length.
-        """
-        count = MOTORS[kind]
-        motors = rows[:, : 3 * count].reshape(len(rows), 3, count)
-        joints = motors[:, :, [number for number, name in enumerate(self._order) if name is not None]]
-        out = dict(zip(("joint_position", "joint_velocity", "joint_torque"), joints.transpose(1, 0, 2), strict=True))
-        if self._settings.frame is not None:
-            out["imu_specific_force"] = rows[:, 3 * count : 3 * count + 3]
-            out["imu_angular_velocity"] = rows[:, 3 * count + 3 : 3 * count + 6]
-            out |= self._orientation(rows[:, 3 * count + 6 : 3 * count + 10])
-        if rows.shape[1] > 3 * count + 10:
-            out["foot_force"] = rows[:, 3 * count + 10 :]
-        return out
-
-    def _orientation(self, wxyz: FloatArray) -> dict[str, FloatArray]:
-        """The base's orientation; nothing where quaternions are always the same, as of a driver that does not set them.
-
-        They are in the order in which others' come (xyzw), so that an odometry takes their place.
-        """
-        if not self._settings.orientation or not np.any(wxyz != wxyz[0]):
-            return {}
-        return {"base_quat_xyzw": np.roll(require_unit(self._topic, wxyz, _KEY), -1, axis=1)}
-
-    # ------------------------------------------------------------------------------------------------------- stamps
-
-    def stamps(self, ticks: NDArray[np.int64], received: NDArray[np.int64]) -> tuple[NDArray[np.int64], bool]:
-        """Stamps (N,) [ns] of messages, on the clock of the recording computer, and whether they are the robot's.
-
-        The robot counts milliseconds since it was switched on, on a clock of its own, from 2^32 on again from 0. What
-        that clock is off by is the median difference to the times of receipt.
-
-        Args:
-            ticks: (N,) [ms] of the messages.
-            received: (N,) [ns], times of receipt.
-
-        Raises:
-            LogError: ticks that are no milliseconds, where `stamps` does not say that they are meant.
-        """
-        wanted, constant = self._settings.stamps, not np.any(np.diff(ticks))
-        if wanted == "receipt" or (wanted is None and constant and (len(ticks) > 1 or not ticks.any())):
-            return received, False
-        steps = (np.diff(ticks) + _WRAP // 2) % _WRAP - _WRAP // 2
-        elapsed = np.concatenate([[0], np.cumsum(steps)]) * _MILLISECOND
-        late = received - received[0] - elapsed
-        usual = int(np.clip(np.median(late), -(1 << 62), 1 << 62))  # also for receipts that no clock would give
-        off = np.abs(late - usual)
-        if wanted is None and off.max() > _OFF + _OFF_SHARE * np.ptp(received):
-            found = (
-                f"ticks that advance by {np.ptp(elapsed) / 1e9:.4g} s while messages come for "
-                f"{np.ptp(received) / 1e9:.4g} s, and are off by up to {off.max() / 1e9:.3g} s"
-            )
-            accepted = f"ticks of 1 ms, or {_KEY}.stamps: receipt, or tick where these are right"
-            raise LogError.at_field(self._topic, found, accepted)
-        return np.asarray(received[:1] + usual + elapsed, dtype=np.int64), True

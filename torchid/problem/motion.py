@@ -15,8 +15,7 @@ from torch import Tensor
 
 from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
-from torchid.logs.log import POINTS
-from torchid.logs.signal_noise import SignalNoise
+from torchid.logs.log import POINTS, SignalNoise
 from torchid.parameters import GRAVITY, Array
 from torchid.regressor import motion_from_state
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix

@@ -11,14 +11,12 @@ from torchid.errors import join_names
 from torchid.logs.bags import FLAGS, IMUS, JOINT_STATES, NUMBER_ARRAYS, NUMBERS, ODOMETRIES, WRENCHES
 from torchid.logs.columns import FILL_IN
 from torchid.logs.log import NORM_TOLERANCE
-from torchid.logs.unitree import JOINT_ORDERS, LowState, suitable_orders
+from torchid.logs.unitree import JOINT_ORDERS, MOTORS, suitable_orders
 from torchid.proposals.columns import TOUCH_WEIGHT, MapProposal
 from torchid.proposals.names import RobotNames, exchange_affixes, find_spelling, is_measured, within, words_of
 from torchid.proposals.samples import TopicSample
 
-USED_TYPES = frozenset(
-    (*JOINT_STATES, *LowState.types, *IMUS, *ODOMETRIES, *WRENCHES, *NUMBERS, *NUMBER_ARRAYS, *FLAGS)
-)
+USED_TYPES = frozenset((*JOINT_STATES, *MOTORS, *IMUS, *ODOMETRIES, *WRENCHES, *NUMBERS, *NUMBER_ARRAYS, *FLAGS))
 """Types of messages that a map of topics may have."""
 
 _LOW_RATE = "/lf/"
@@ -131,7 +129,7 @@ class _Proposer:
 
     def _place_low_state(self) -> None:
         """The state of a robot of Unitree, if the URDF has its joints."""
-        for name, topic in self._of(LowState.types).items():
+        for name, topic in self._of(tuple(MOTORS)).items():
             if not (robot := self._robot_of(topic)):
                 continue
             entry: dict[str, Any] = {"topic": name, "robot": robot}
