@@ -131,8 +131,14 @@ def staging_folder(target: Path) -> Iterator[Path]:
                     handle = lock(folder) if fcntl is not None else os.open(os.devnull, os.O_RDONLY)
         yield folder
     finally:
-        with interrupts_deferred():
-            if handle >= 0:
+        try:
+            with interrupts_deferred():
+                if handle >= 0:
+                    _discard(folder)
+                    os.close(handle)
+                    handle = -1
+        finally:
+            if handle >= 0:  # Ctrl-C before it was deferred
                 _discard(folder)
                 os.close(handle)
 

@@ -5,14 +5,19 @@ from __future__ import annotations
 import random
 import shutil
 import signal
+import sys
 import time
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import pytest
 from hostile_commands import Commands
 from refusals import files_in
 from run_folders import names_in
 from thinned import slow_but
+
+from torchid.staging import NEW, staging_folder
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP)
 COMMANDS = ("identify", "train", "evaluate", "analyze", "convert", "compress")
@@ -115,3 +120,32 @@ def test_a_run_that_is_replaced_is_there_at_any_moment(
         server.stopped(line, number, draw.uniform(0.7, 1.0) * seconds)
         assert content(out) == content(run)
         assert names_in(tmp_path) == ["run"]
+
+
+def test_ctrl_c_at_any_step_of_the_way_out_leaves_no_staging_folder(tmp_path: Path) -> None:
+    """Also just before it is deferred; Python looks for signals in the functions that are called there."""
+
+    def interrupt(frame: FrameType, _: str, __: object) -> Any:
+        nonlocal steps
+        if frame.f_code is staging_folder.__wrapped__.__code__:  # type: ignore[attr-defined]
+            return interrupt
+        if Path(frame.f_code.co_filename).name not in ("staging.py", "contextlib.py"):
+            return None
+        steps += 1
+        if steps == chosen:
+            signal.raise_signal(signal.SIGINT)
+        return interrupt
+
+    steps, chosen, interrupted = 0, 0, 0
+    while steps >= chosen:
+        steps, chosen = 0, chosen + 1
+        sys.settrace(interrupt)
+        try:
+            with staging_folder(tmp_path / "out") as folder:
+                (folder / NEW).write_text("half")
+        except KeyboardInterrupt:
+            interrupted += 1
+        finally:
+            sys.settrace(None)
+        assert names_in(tmp_path) == [], chosen
+    assert interrupted == chosen - 1 > 50
