@@ -241,3 +241,24 @@ def test_sensors_in_limbs_are_planned_named_and_drawn(experiment: Path) -> None:
     assert (answer["cost"], answer["proven"]) == (27.0, True)
     assert {check["random_postures"]["rank"] for check in answer["checks"] + answer["proposed"]} == {6}
     assert answer["exclude"] == [WELDS[0]]
+
+
+def test_an_output_without_a_name_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = refusal(["analyze", str(asked(experiment, output="/"))], experiment, capsys)
+    assert "no name for a file or folder" in message
+
+
+def test_a_robot_that_cannot_move_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    inertial = "<mass value='1'/><inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/>"
+    stone = experiment / "stone.urdf"
+    stone.write_text(f"<robot name='stone'><link name='stone'><inertial>{inertial}</inertial></link></robot>")
+    file = asked(experiment, robot={"urdf": str(stone), "fixed_base": True}, contacts=[])
+    assert "accepted: a robot that can move" in refusal(["analyze", str(file)], experiment, capsys)
+
+
+def test_sensors_that_tell_nothing_leave_nothing_to_determine(experiment: Path) -> None:
+    robot, output = {"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True}, experiment / "blind"
+    file = asked(experiment, robot=robot, sensors="contacts", analysis={"scenarios": {"air": [[]]}}, output=str(output))
+    assert main(["analyze", str(file)]) == 0
+    plan = json.loads((experiment / "blind.analysis" / "analysis.json").read_text())["scenarios"]["air"]
+    assert (plan["base_parameters"]["rank"], plan["base_parameters"]["gap"]) == (0, None)

@@ -221,3 +221,8 @@ def test_a_terminal_gets_no_warning_of_what_its_answer_says_is_confounded(monkey
     for terminal, fold in ((False, True), (True, False), (True, True)):
         lines = _warn_of_logs(told, monkeypatch, terminal=terminal, fold=fold, category=ConfoundedWarning)
         assert bool(lines) is not (terminal and fold)
+
+
+def test_a_traceback_is_shown_to_who_asks(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_guarded("torchid", lambda: {}["x"], debug=True) == 1
+    assert "Traceback" in capsys.readouterr().err

@@ -352,3 +352,38 @@ def test_a_failure_that_is_no_bad_input_exits_1_without_a_traceback(
     assert main(["identify", str(experiment / "quadruped.yaml")]) == 1
     assert "No space left" in capsys.readouterr().err
     assert files_in(experiment.parent) == before
+
+
+def test_a_limb_sensor_is_planned_at_a_fixed_joint_only(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    override = "analysis.candidates.ft_sensors=[front_left_knee]"
+    line = refusal(["analyze", str(experiment / "quadruped.yaml"), override], experiment.parent, capsys)
+    assert "analysis.candidates.ft_sensors: 'front_left_knee', a revolute joint, not a fixed joint" in line
+
+
+@pytest.mark.parametrize("command", ["identify", "analyze", "simulate", "compress"])
+def test_a_robot_in_place_of_an_experiment_file_is_told_for_what_it_is(
+    experiment: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    urdf = experiment / "quadruped.urdf"
+    short = experiment / "short.urdf"
+    short.write_text('<robot name="r"><!-- mass: 1 kg --><link name="a"/></robot>')
+    for path in (urdf, short):
+        output = ["--output", str(experiment / "factors")] * (command == "compress")
+        line = refusal([command, str(path), *output], experiment.parent, capsys)
+        assert f"{path}: YAML: text, <" in line
+        assert "accepted: a mapping with robot, " in line
+        assert len(line) < 250
+
+
+@pytest.mark.parametrize("override", ["contacts[0].type=flat", "contacts.0.type=flat", "sensors=[joints]"])
+def test_an_override_that_does_not_fit_the_file_is_refused(
+    experiment: Path, capsys: pytest.CaptureFixture[str], override: str
+) -> None:
+    assert main(["identify", str(experiment / "quadruped.yaml"), override]) == 2
+    assert "accepted: " in capsys.readouterr().err
+
+
+def test_evaluate_refuses_a_folder_that_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(tmp_path), "--log", "x.npz"]) == 2
+    assert "config.yaml" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -142,3 +142,10 @@ def test_check_says_how_open_loops_are(tmp_path: Path, capsys: pytest.CaptureFix
     assert "closed loop" in out
     for part in ("pin of coupler", "and pin of shank are together up to rms", "nothing: accepted is rms"):
         assert part in out
+
+
+def test_joints_without_a_motor_are_named_or_matched(tmp_path: Path) -> None:
+    w = loop_world(LEG)
+    for passive, message in ((["knie"], "robot.passive: unknown name 'knie'"), (["z*"], "'z*' matches no joint")):
+        with pytest.raises(TorchidError, match=message.replace("*", r"\*")):
+            set_up(load_config(experiment(tmp_path, w, mjcf=str(w.path), passive=passive)))

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from demo import DEMO
 from motions import value
-from refusals import refused
+from refusals import refusal, refused
 
 from torchid.cli import main
 from torchid.commands.check import check_experiment
@@ -122,3 +122,9 @@ def test_a_fit_of_zeroed_sensors_is_that_of_sensors_without_offsets(tmp_path: Pa
     assert main(["identify", str(file)]) == 0
     found, expected = parameters_of(fit_of(tmp_path / "run")), parameters_of(simulated)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+
+
+def test_offsets_have_one_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = experiment(tmp_path, change=lambda log: log, zero_in_air=True)
+    line = refusal(["identify", str(file), "sensors.offsets={contact_moment: log}"], tmp_path, capsys)
+    assert "sensors.offsets.contact_moment: set together with preprocessing.zero_in_air" in line

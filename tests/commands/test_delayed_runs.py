@@ -66,3 +66,13 @@ def test_a_run_on_a_motion_that_fits_any_delay_takes_none(tmp_path: Path) -> Non
     file = commanded(tmp_path, (1, 0.02), actuators={"armature": True, "stiffness": True, "delay": "auto"})
     assert main(["identify", str(file)]) == 0
     assert load_config(tmp_path / "run" / "config.yaml").actuators.delay == 0.0
+
+
+@pytest.mark.filterwarnings("ignore:.*stated sensor noise")
+def test_no_delay_is_looked_for_in_logs_without_a_filter(tmp_path: Path) -> None:
+    """White noise between samples is smaller than at them, which would draw it to half a step."""
+    file, found = commanded(tmp_path, preprocessing={}), []
+    for more in ([], ["preprocessing.cutoff_hz=40", "overwrite=true"]):
+        assert main(["identify", str(file), *more]) == 0
+        found.append(load_config(tmp_path / "run" / "config.yaml").actuators.delay)
+    assert found == [0.0, pytest.approx(DELAY, rel=0.1)]

@@ -11,10 +11,15 @@ import pytest
 import yaml
 from misread import WIDTH, World, with_actuators
 from recordings import Miscalibration
+from repository import DEMO
+from rich.progress import Progress
 from synthetic import Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.cli import main
+from torchid.commands.chosen_settings import with_chosen_settings
+from torchid.config import load_config
+from torchid.fitting.experiment import set_up
 from torchid.logs import write_log
 from torchid.problem import ExtraTerms
 
@@ -133,3 +138,26 @@ def test_actuators_that_cannot_be_stand_on_their_bounds_and_are_named(
     )
     assert found["at_bound"]
     assert -found["value"] == pytest.approx(resisting, abs=1e-4)
+
+
+def test_the_width_of_the_sign_is_found_where_friction_does_not_reverse_at_once(run: Run) -> None:
+    """Everything else is fitted anew for each width. Friction of the demo goes with the sign itself."""
+    demo = [f"logs.train=['{DEMO / 'sway_train.npz'}[:6]']"]
+    widths = []
+    for file, more in ((run.file, []), (DEMO / "quadruped.yaml", demo)):
+        setup = set_up(load_config(file, ["actuators.sign_width=auto", *more]))
+        choice = with_chosen_settings(setup, Progress(disable=True))[1].sign_width
+        assert choice is not None
+        widths.append(choice.width)
+    assert widths == [pytest.approx(WIDTH, rel=2e-3), None]
+
+
+def test_a_urdf_that_is_right_has_no_errors_whatever_the_offsets(tmp_path: Path) -> None:
+    """Offsets and actuators are fitted for it too: those of the identified parameters would be held against it."""
+    file, _, _ = files(tmp_path, 0.0)
+    assert main(["identify", str(file), f"logs.train=[{tmp_path / 'first.npz'}]"]) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert max(errors_in(metrics["train_nominal"]).values()) < 1e-8
+    assert main(["evaluate", str(tmp_path / "run"), "--log", str(tmp_path / "new.npz")]) == 0
+    (written,) = (tmp_path / "run" / "evaluation").rglob("metrics.json")
+    assert max(errors_in(json.loads(written.read_text())["new"]["nominal"]).values()) < 1e-8

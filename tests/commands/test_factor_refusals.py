@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -218,3 +220,39 @@ def test_damaged_files_give_a_fit_or_one_line(fleet: Path, tmp_path: Path) -> No
     tally = examined("damaged factors", cases(), read_factors, tmp_path)
     assert tally.faults == []
     assert tally.share("refused") > 0.3, "or the files were hardly damaged"
+
+
+def test_logs_of_one_name_are_not_compressed_to_one_file(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(fleet / "sway_test.npz", tmp_path / "sway_train.npz")
+    logs = f"logs.train=[{fleet / 'sway_train.npz'}, {tmp_path / 'sway_train.npz'}]"
+    line = ["compress", str(fleet / "logs.yaml"), logs, "--output", str(fleet / "out")]
+    assert "several logs that would become sway_train.factor" in refusal(line, fleet, capsys)
+
+
+def rewritten(path: Path, target: Path, change: Callable[[dict[str, Any], dict[str, Any]], None]) -> Path:
+    """A file whose description and arrays are changed."""
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    description = json.loads(arrays["description"].tobytes())
+    change(description, arrays)
+    arrays["description"] = np.frombuffer(json.dumps(description).encode(), np.uint8)
+    with target.open("wb") as stream:
+        np.savez(stream, **arrays)
+    return target
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_files_are_refused_in_one_line(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
+) -> None:
+    path = rewritten(fleet / "factors" / "sway_train.factor", tmp_path / "bad.factor", HOSTILE[case])
+    message = refusal(["identify", str(fleet / "experiment.yaml"), f"logs.train=[{path}]"], fleet, capsys)
+    assert message.startswith(f"torchid: {path}: "), message
+    assert len(message) < 600
+    if case == "a later format":
+        assert f"{path}: format: {FORMAT + 1}, of another version of torchid; accepted: {FORMAT}" in message
+    if case == ONE_NOISE:
+        assert f"{path}: sensors.noise: joint_torque, base_force.x" in message
+        assert "accepted: joint_torque.front_left_hip" in message

@@ -195,3 +195,16 @@ def test_only_factor_files_are_written_and_read(fleet: Path, tmp_path: Path) -> 
         (tmp_path / "a.factor").mkdir(exist_ok=True)
         with pytest.raises(torchid.TorchidError, match="accepted: a whole .factor file"):
             read_factors(tmp_path / name)
+
+
+def test_rejected_samples_are_left_out_when_logs_are_compressed(fleet: Path, tmp_path: Path) -> None:
+    with np.load(fleet / "sway_train.npz") as log:
+        fields = dict(log)
+    fields["joint_torque"] = fields["joint_torque"].copy()
+    fields["joint_torque"][100, 3] += 500.0
+    np.savez(tmp_path / "spike.npz", **fields)
+    overrides = [f"logs.train=[{tmp_path / 'spike.npz'}]", "preprocessing.exclude_rejected=true"]
+    assert main(["compress", str(fleet / "logs.yaml"), "--output", str(tmp_path / "f"), *overrides]) == 0
+    found = read_factors(tmp_path / "f" / "spike.factor")
+    assert found.excluded > 0
+    assert found.excluded + len(found.log) == KEPT

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,13 @@ from motions import value
 from plates import LABORATORIES, centres_of_pressure, plates_csv, walk, write_motion
 from raw_logs import write_arrays
 from refusals import refusal
+from repository import SHARED
 from scipy.spatial.transform import Rotation
-from simulated import BIPED
+from simulated import BIPED, feet_of
 from thinned import slow_but
 
 from torchid.cli import main
-from torchid.logs import Log, write_log
+from torchid.logs import Log, read_log, write_log
 
 MOTION = "motion.npz + plates.csv"
 
@@ -129,3 +131,19 @@ def test_plates_without_a_pose_in_their_world_are_refused(tmp_path: Path, capsys
     np.savez(tmp_path / "motion.npz", base_linear_velocity_world=velocity, **rest)
     complaint = refusal(["identify", str(experiment(tmp_path, MOTION, text))], tmp_path, capsys)
     assert "contact_wrench_point_world: given without base_position_world" in complaint
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded logs (../shared/data) are not here")
+def test_a_plate_that_lies_elsewhere_is_noticed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A person on two plates, said to be 10 cm from where they are."""
+    folder = SHARED / "human_squats"
+    log = read_log(folder / "squats1.npz").select(slice(0, 600))
+    wrench = value(log.contact_wrench_world)
+    places = feet_of(log, folder / "human.urdf")[0] - [0.1, 0.0, 0.0]
+    moments = wrench[..., 3:] + np.cross(places, wrench[..., :3])
+    about_origin = np.concatenate([wrench[..., :3], moments], axis=2)
+    write_log(replace(log, contact_wrench_world=about_origin, moments_about_world_origin=True), tmp_path / "walk.npz")
+    main(["check", str(tmp_path / "walk.npz"), "--urdf", str(folder / "human.urdf")])
+    printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "contact_wrench_world, point" in printed
+    assert "check the points of" in printed

@@ -207,3 +207,17 @@ def test_force_plates_alone_identify_a_person_who_then_squats_differently(tmp_pa
     assert_loads(tmp_path / "run" / "identified.urdf", metrics["total_mass"])
     assert metrics["test"]["joint_torque_rms"] is None
     assert metrics["test"]["nullspace_rms"] is None
+
+
+def test_logs_of_one_name_are_not_evaluated_as_one(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = str(DEMO / "sway_test.npz")
+    assert main(["evaluate", str(run), "--log", log, "--log", log]) == 2
+    assert "several logs named 'sway_test'" in capsys.readouterr().err
+
+
+def test_positions_in_degrees_stop_a_run_that_names_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    demo_with(tmp_path / "demo", joint_position=np.rad2deg)
+    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), FAST]) == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "torchid check finds in sway_train.npz: joint_position: " in told
+    assert "degrees?; accepted: convert joint_position" in told

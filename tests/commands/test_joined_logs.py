@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from demo import shortened_demo
+from demo import FAST_ESTIMATOR, shortened_demo
 
 from torchid.cli import main
 from torchid.config import load_config
@@ -87,3 +87,15 @@ def test_what_several_files_are_not_for_is_refused(demo: Path, capsys: pytest.Ca
     large = f"logs.train={json.dumps([JOINED])}", "preprocessing.memory_gb=1e-4"
     assert "file: several files with arrays of" in refusal(capsys, "identify", "quadruped.yaml", *large)
     assert "belongs to what is read" in refusal(capsys, "convert", NAME, "plates.npz", "--overwrite")
+
+
+def test_no_sample_of_the_first_file_is_used_twice(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = "motion.npz + torques.npz + plates.npz@-3"
+    error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:4]', other + '[3:]'])}")
+    assert "share samples; accepted: every sample once" in error
+    train, test = (
+        f"logs.{name}={json.dumps([log])}" for name, log in (("train", NAME + "[:4]"), ("test", other + "[3:]"))
+    )
+    fast = f"estimator={json.dumps(FAST_ESTIMATOR)}"
+    assert main(["identify", "quadruped.yaml", train, test, fast, "output=runs/x"]) == 0
+    assert f"{other}[3:] is fitted on as well" in capsys.readouterr().err

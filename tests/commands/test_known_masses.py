@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
+from arms import ARMS
 from currents import HIP_SCALE, HIPS, KNEE_SCALE, KNEES, NOISE, quadruped_files
 from refusals import refusal
 from repository import SHARED
 from synthetic import ROBOTS
 
 from torchid.cli import main
+from torchid.commands.identify import identify
+from torchid.config import load_config
+from torchid.errors import ConfoundedWarning
+from torchid.estimators import LeastSquares
+from torchid.fitting.prior_knowledge import KnownMass, with_known_masses
+from torchid.identifiability.confounding import combination_standard_error, mass_weights
+from torchid.parameters import PER_BODY
+from torchid.problem import LinearProblem
 
 SCALES = dict.fromkeys(HIPS, HIP_SCALE) | dict.fromkeys(KNEES, KNEE_SCALE)
 SENSORS = {"set": "joints", "noise": NOISE, "scales": {"joint_torque": [HIPS, KNEES]}}
@@ -107,3 +118,82 @@ def test_a_recorded_robot_that_stands_on_all_feet_is_refused_with_the_reason(
     message = refusal(["identify", str(tmp_path / "go2.yaml")], tmp_path, capsys)
     assert "sensors.scales: of all measured forces, which no mass determines here: scale of *_hip_joint" in message
     assert "accepted: a sensor without a scale, or logs in which each contact lifts" in message
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf")
+def test_without_it_they_are_confounded_and_of_the_size_that_the_urdf_s_mass_makes_them(
+    world: tuple[Path, float], tmp_path: Path
+) -> None:
+    file, mass = world
+    with pytest.warns(ConfoundedWarning) as caught:
+        identify(load_config(file, [f"output={tmp_path / 'run'}"]))
+    (message,) = (str(x.message) for x in caught if issubclass(x.category, ConfoundedWarning))
+    said = "scale of *_hip,*_thigh, *_knee: confounded with the total mass; do not trust either; state estimator."
+    assert said in message
+    (confounded,) = document(tmp_path / "run", "metrics")["confounded"]
+    assert (confounded["extras"], confounded["confounded_with"]) == (list(LABELS), ["total mass"])
+    assert said in confounded["message"]
+    assert not any(entry["told_apart"] for entry in scales_of(tmp_path / "run").values())
+    assert all(entry["standard_error"] is None for entry in scales_of(tmp_path / "run").values())
+    assert document(tmp_path / "run", "metrics")["total_mass"] is None
+    values = [1.0 + scales_of(tmp_path / "run")[label]["value"] for label in LABELS]
+    urdf = document(tmp_path / "run", "metrics")["total_mass_nominal"]
+    assert values == pytest.approx([HIP_SCALE * urdf / mass, KNEE_SCALE * urdf / mass], rel=1e-7)
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf")
+def test_scales_of_all_motors_of_a_bolted_robot_are_refused_without_a_word_of_contacts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "arms.urdf").write_text(ARMS)
+    time = np.arange(2000) / 100.0
+    position = np.stack([np.sin(2.0 * time) + 0.3 * np.sin(5.0 * time), np.cos(3.0 * time)], axis=1)
+    torque = np.stack([9.81 * np.cos(position[:, 0]), position[:, 1]], axis=1)
+    log = {"time": time, "joint_names": ["first", "second"], "joint_position": position, "joint_torque": torque}
+    np.savez(tmp_path / "log.npz", **log)
+    experiment = {
+        "robot": {"urdf": "arms.urdf", "fixed_base": True},
+        "logs": {"train": ["log.npz"]},
+        "preprocessing": {"cutoff_hz": 10},
+        "sensors": {"set": "joints", "scales": {"joint_torque": "all"}},
+        "output": str(tmp_path / "run"),
+    }
+    (tmp_path / "arms.yaml").write_text(yaml.safe_dump(experiment))
+    message = refusal(["identify", str(tmp_path / "arms.yaml")], tmp_path, capsys)
+    assert "sensors.scales: of all measured forces, which no mass determines here" in message
+    assert "accepted: a sensor without a scale, or estimator.masses of bodies whose weight acts on it" in message
+
+
+def test_exact_masses_hold_whatever_the_data_say_and_uncertain_ones_are_weighed() -> None:
+    """Against the optimum with a Lagrange multiplier, and against rows of their own."""
+    rng, count = np.random.default_rng(0), 3 * PER_BODY
+    A, b = rng.normal(size=(2 * count, count)), rng.normal(size=2 * count)
+    nominal, scale = rng.uniform(0.5, 1.0, count), rng.uniform(0.5, 2.0, count)
+    free = np.ones(count, dtype=bool)
+    free[PER_BODY : 2 * PER_BODY] = False
+    problem = LinearProblem(A, b, 0.0, 2 * count, nominal, scale, free)
+    total, one = mass_weights(3), mass_weights(3) * (np.arange(count) == 0)
+    exact = KnownMass("a", total, 7.0), KnownMass("b", one, 2.5)
+    found = LeastSquares().solve(with_known_masses(problem, exact)).phi
+    E = np.array([total, one])[:, free]
+    known = np.array([7.0, 2.5]) - np.array([total, one])[:, ~free] @ nominal[~free]
+    left = b - A[:, ~free] @ nominal[~free]
+    H = np.block([[A[:, free].T @ A[:, free], E.T], [E, np.zeros((2, 2))]])
+    expected = np.linalg.solve(H, np.append(A[:, free].T @ left, known))[: free.sum()]
+    np.testing.assert_allclose(found[free], expected, rtol=1e-9)
+    assert np.array_equal(found[~free], nominal[~free])
+    uncertain = with_known_masses(problem, [KnownMass("a", total, 7.0, 0.2)], 1.5)
+    rows = np.vstack([A, 1.5 / 0.2 * total])
+    expected = np.linalg.lstsq(rows[:, free], np.append(left, 7.5 * (7.0 - total[~free] @ nominal[~free])))[0]
+    np.testing.assert_allclose(LeastSquares().solve(uncertain).phi[free], expected, rtol=1e-9)
+
+
+def test_a_known_mass_is_as_well_known_where_other_rows_are_mostly_noise_of_the_motion() -> None:
+    rng, count = np.random.default_rng(0), 3 * PER_BODY
+    A, b = rng.normal(size=(2 * count, count)), rng.normal(size=2 * count)
+    problem = LinearProblem(A, b, 0.0, 2 * count, np.ones(count), np.ones(count), np.ones(count, dtype=bool))
+    lacking, total = replace(problem, shrinkage=0.5 * A), mass_weights(3)
+    known = [with_known_masses(x, [KnownMass("a", total, 7.0)]) for x in (problem, lacking)]
+    errors = [combination_standard_error(x, LeastSquares().solve(x), total) for x in (problem, lacking, *known)]
+    assert errors[1] > 2.0 * errors[0]
+    assert errors[3] == pytest.approx(errors[2], rel=1e-9), "the row of the mass lacks nothing"

@@ -14,9 +14,11 @@ from demo import shortened_demo
 from large import tensors
 
 from torchid.cli import main
+from torchid.commands.compress import compress
 from torchid.config import load_config
 from torchid.errors import ConfigError, TorchidWarning
 from torchid.fitting.experiment import set_up
+from torchid.fitting.factor_files import read_factors
 from torchid.logs import read_log, write_log
 from torchid.problem import Samples
 from torchid.reading.log_reader import LogReader
@@ -112,3 +114,24 @@ def test_a_range_outside_of_the_log_ends_in_one_line(
         "accepted: a part of 0 to 7 s that has samples"
     )
     assert not (tmp_path / "run").exists()
+
+
+def test_parts_are_compressed_to_files_of_their_own(demo: Path, tmp_path: Path) -> None:
+    parts = [demo / f"sway_train.npz{text}" for text in ("[:7]", "[7:]")]
+    config = load_config(demo / "quadruped.yaml", [f"logs.train={[*map(str, parts)]}", "logs.test=[]"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        found = compress(config, tmp_path / "factors")
+    assert [one.name for one in found.files] == ["sway_train[:7].factor", "sway_train[7:].factor"]
+    assert len({read_factors(tmp_path / "factors" / one.name).sha256 for one in found.files}) == 2
+
+
+def test_a_part_is_checked_and_converted(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(demo)
+    main(["check", "sway_train.npz[-6:]"])
+    assert "600 samples" in " ".join(capsys.readouterr().out.split())
+    assert main(["convert", "sway_train.npz[:7]", str(tmp_path / "x.h5")]) == 0
+    assert len(read_log(tmp_path / "x.h5")) == 700
+    assert main(["convert", "sway_train.npz[:7]", "sway_train.npz", "--overwrite"]) == 2  # which is read

@@ -19,9 +19,14 @@ from mujoco_oracle import INERTIA_ROUNDING
 import torchid
 from torchid.cli import main
 from torchid.commands import EXPORT_FORMATS
+from torchid.commands.export import export
 from torchid.config import load_config
+from torchid.errors import ConfigError
 from torchid.fitting.experiment import set_up
-from torchid.report.mjcf_files import mjcf_of_urdf
+from torchid.problem.chunks import chunks_by_state
+from torchid.problem.metrics import force_series
+from torchid.reading.log_reader import LogReader
+from torchid.report.mjcf_files import identified_mjcf, mjcf_of_urdf
 from torchid.robot import load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore:identified:torchid.errors.TorchidWarning")
@@ -133,3 +138,72 @@ def test_init_writes_what_a_fit_takes_of_a_trunk_on_slides_with_feet(tmp_path: P
     assert setup.robot.fixed_base
     assert [contact.frame for contact in setup.contacts] == ["l_foot", "r_foot"]
     assert yaml.safe_load(file.read_text())["logs"]["columns"]["contact_active"] == {"always": ["l_foot", "r_foot"]}
+
+
+def models(runs: dict[str, Path], folder: Path, of_joints: str) -> tuple[Path, Path]:
+    """The robot's model, and one whose joints have attributes more."""
+    bare, other = runs["mjcf"].parent / "quadruped.xml", folder / "rotors.xml"
+    other.write_text(bare.read_text().replace("<joint ", f"<joint {of_joints} "))
+    return bare, other
+
+
+def test_a_known_armature_is_taken_off_the_torques_and_a_fitted_one_is_all_of_it(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    bare, with_rotors = models(runs, tmp_path, 'armature="0.05" stiffness="2" springref="0.1"')
+    rows = {}
+    for name, file, fitted in (("all", bare, True), ("none", bare, False), ("known", with_rotors, False)):
+        actuators = {"armature": fitted, "stiffness": fitted, "torque_offset": fitted}
+        sections: dict[str, Any] = {"robot": {"urdf": None, "mjcf": file}, "actuators": actuators}
+        experiment = set_up(load_config(DEMO / "quadruped.yaml", (), sections | {"output": None}))
+        (samples,) = LogReader(experiment, None).read([LOG], None, lambda _: None)
+        builder, (state, index) = experiment.builder(experiment.sensors), next(iter(chunks_by_state(samples)))
+        rows[name] = builder.rows_by_sample(samples[index], state)[0].numpy()
+        series = force_series(
+            builder, samples, np.append(experiment.robot.nominal, np.zeros(len(builder.extras)))[None]
+        )
+        rows[f"predicted {name}"] = series[1][0]
+    size = rows["none"].shape[2] - 1
+    armature, offset, stiffness = (rows["all"][..., size:-1][..., k : k + 12].sum(-1) for k in (0, 12, 24))
+    expected = rows["none"][..., -1] - (0.05 * armature + 2.0 * stiffness - 0.2 * offset)
+    np.testing.assert_allclose(rows["known"][..., -1], expected, atol=1e-10 * np.abs(expected).max())
+    torque = 0.05 * samples.joint_acceleration + 2.0 * (samples.joint_position - 0.1)
+    difference = rows["predicted known"][:, 6:] - rows["predicted none"][:, 6:]
+    np.testing.assert_allclose(difference, torque.numpy(), atol=1e-10)
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.ConfoundedWarning")
+def test_a_fitted_armature_does_not_depend_on_that_of_the_file_and_is_written(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    settings: dict[str, Any] = {
+        "logs": {"train": [f"{LOG}[:6]"], "test": []},
+        "output": None,
+        "actuators": {"armature": True},
+        "estimator": {"name": "least_squares", "ridge": 1e-3},
+    }
+    fits = [
+        torchid.identify(DEMO / "quadruped.yaml", robot={"urdf": None, "mjcf": file}, **settings)
+        for file in models(runs, tmp_path, 'armature="0.05"')
+    ]
+    armatures = [fit.fitted_joints.armature for fit in fits]
+    assert armatures[1] == pytest.approx(armatures[0], abs=1e-10)
+    robot = fits[1].experiment.robot
+    text = identified_mjcf(robot, robot.nominal, armatures[1]).decode()
+    written = dict(re.findall(r'<joint armature="([^"]*)" name="([^"]*)"', text))
+    assert {name: float(value) for value, name in written.items()} == armatures[1]
+
+
+def test_a_log_is_checked_against_one_robot_alone(runs: dict[str, Path]) -> None:
+    file = runs["mjcf"].parent / "quadruped.xml"
+    with pytest.raises(ConfigError, match="urdf or mjcf"):
+        torchid.check(LOG, robot={"mjcf": file, "urdf": DEMO / "quadruped.urdf"})
+
+
+def test_no_file_is_replaced_unless_told_so(runs: dict[str, Path], tmp_path: Path) -> None:
+    target = tmp_path / "out.json"
+    target.write_text("mine")
+    with pytest.raises(torchid.TorchidError, match="exists; accepted: a new file, or --overwrite"):
+        export(runs["urdf"], "json", target)
+    export(runs["urdf"], "json", target, overwrite=True)
+    assert json.loads(target.read_text())["joints"]

@@ -281,3 +281,28 @@ def test_files_are_replaced_only_on_request_and_links_and_inputs_never(
     (tmp_path / "same.npz").hardlink_to(log)
     for target in (log, tmp_path / "." / "log.npz"):
         assert "what is read" in refusal(["convert", str(log), str(target), "--overwrite"], tmp_path, capsys)
+
+
+def test_experiments_never_remove_what_they_read(copy: Path, place: Path, tmp_path: Path, server: Commands) -> None:
+    """A log in the output, the output above the logs, the URDF and the settings of the run that is replaced."""
+    demo, more = place / "demo", [f"output={copy}", "overwrite=true"]
+    shutil.copy(demo / "sway_test.npz", copy / "mine.npz")
+    line = refused(
+        server, ["identify", str(demo / "quadruped.yaml"), *more, f"logs.test=[{copy / 'mine.npz'}]"], tmp_path
+    )
+    assert "mine.npz, which is an input" in line
+    (copy / "mine.npz").unlink()
+    line = refused(server, ["identify", str(copy / "config.yaml"), *more], tmp_path)
+    assert "config.yaml, which is an input" in line
+    line = refused(
+        server, ["identify", str(demo / "quadruped.yaml"), *more, f"robot.urdf={copy}/identified.urdf"], tmp_path
+    )
+    assert "identified.urdf, which is an input" in line
+    shutil.copytree(demo, tmp_path / "project" / "logs")
+    for command in ("identify", "analyze"):
+        output = tmp_path / ("project.analysis" if command == "analyze" else "project")
+        if command == "analyze":
+            (tmp_path / "project").rename(output)
+        more = [f"output={tmp_path / 'project'}", "overwrite=true"]
+        line = refused(server, [command, str(output / "logs" / "quadruped.yaml"), *more], tmp_path)
+        assert "logs/quadruped.yaml, which is an input" in line

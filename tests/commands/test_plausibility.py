@@ -13,10 +13,12 @@ import pytest
 from demo import FAST_ESTIMATOR
 from repository import DEMO
 from synthetic import UR5, Oracle, load, make_log
+from urdfs import inertial, joint, link, write
 
 import torchid
 from torchid.cli import main
-from torchid.commands.plausibility import implausibility
+from torchid.commands.plausibility import force_gain, implausibility
+from torchid.estimators import LeastSquares
 from torchid.identifiability.confounding import TotalMass
 from torchid.problem import (
     LinearProblem,
@@ -172,3 +174,56 @@ def test_a_total_mass_counts_where_the_data_determine_it(mass: TotalMass, determ
     problem, robot = arm_problem()
     assert mass.determined is determined
     assert (implausibility(problem, problem.nominal, mass, robot) is not None) is stops
+
+
+@pytest.mark.parametrize(("factor", "stops"), [(1.0, False), (3.0, False), (-1.0, True), (1e3, True), (1e-3, True)])
+def test_an_arm_s_torques_of_the_wrong_sign_or_unit_are_noticed_without_a_total_mass(
+    factor: float, stops: bool
+) -> None:
+    problem, robot = arm_problem(factor)
+    assert force_gain(problem) == pytest.approx(factor, rel=1e-6)
+    estimate, unknown = LeastSquares().solve(problem), TotalMass(float("inf"), True, -3.0, 18.0)
+    found = implausibility(problem, estimate.phi, unknown, robot)
+    assert (found is not None) is stops
+    assert ("opposite sign" in (found or "")) is (factor < 0.0)
+
+
+def test_a_single_body_may_break_conditions_but_not_be_beyond_all_bounds() -> None:
+    problem, robot = arm_problem()
+    unknown, phi = TotalMass(float("inf"), True, 0.0, 18.0), problem.nominal.copy()
+    phi[12] = -3.0  # seen in combination with others only: a condition that is broken, and no more
+    assert implausibility(problem, phi, unknown, robot) is None
+    phi[12] = 1e11
+    assert "shoulder_link has m = 1e+11" in (implausibility(problem, phi, unknown, robot) or "")
+    phi[12], phi[22] = 3.0, 3.9e161
+    assert "fc = 3.9e+161" in (implausibility(problem, phi, unknown, robot) or "")
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["right", "reversed"])
+def test_forces_of_bodies_that_cannot_exist_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], sign: float
+) -> None:
+    limit = '<limit lower="-2" upper="2" effort="99" velocity="9"/>'
+    slides = [
+        joint(name, parent, child, "prismatic", f'<axis xyz="{axis}"/>{limit}')
+        for name, parent, child, axis in (("x", "base", "bridge", "1 0 0"), ("y", "bridge", "head", "0 1 0"))
+    ]
+    urdf = write(tmp_path, link("base"), link("bridge"), link("head", inertial(mass="0.2")), *slides)
+    time = np.arange(2000) / 100.0
+    rate = 2.0 * np.pi * np.array([0.5, 0.7])
+    position = np.sin(rate * time[:, None])
+    force = np.array([1.3, sign * 0.25]) * -(rate**2) * position  # [N] of 1.05 and 0.25 kg
+    force = force + 0.05 * np.random.default_rng(0).normal(size=force.shape)
+    names = np.array(["x", "y"])
+    np.savez(tmp_path / "log.npz", time=time, joint_names=names, joint_position=position, joint_torque=force)
+    settings = {
+        "robot": {"urdf": urdf.name, "fixed_base": True},
+        "logs": {"train": ["log.npz[:80%]"], "test": ["log.npz[80%:]"]},
+        "preprocessing": {"cutoff_hz": 5},
+        "sensors": "joints",
+        "estimator": {"name": "consistent", "ridge": 1e-4},
+        "output": str(tmp_path / "run"),
+    }
+    (tmp_path / "stage.yaml").write_text(json.dumps(settings))
+    assert main(["identify", str(tmp_path / "stage.yaml")]) == 0
+    assert ("no bodies that can exist explain these forces" in capsys.readouterr().out) == (sign < 0.0)

@@ -8,14 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from demo import shortened_demo
 from refusals import refusal
 from repository import DEMO
 
 from torchid.cli import main
 from torchid.commands.folder import REPLAY, read_manifest
-from torchid.commands.replay import PARAMETER_SAMPLES, Replay
+from torchid.commands.replay import PARAMETER_SAMPLES, Replay, _feet, replay
+from torchid.errors import ConfigError
 from torchid.fitting.calibration import Comparison
 from torchid.report.figures import drift_figure
+from torchid.sensing import Contact
 from torchid.simulation.replay import Drift
 from torchid.terminal.simulations import replay_lines
 
@@ -134,3 +137,37 @@ def test_what_a_replay_lacks_is_named(run: Path, tmp_path: Path, capsys: pytest.
     assert "a folder that torchid identify wrote" in refusal(
         ["replay", str(tmp_path), "--log", UNSEEN], tmp_path, capsys
     )
+
+
+def test_a_replay_replaces_nothing_but_a_replay(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    again = ["replay", str(run), "--log", UNSEEN, "--output", str(run)]
+    assert "not empty; accepted: a new folder, or --overwrite" in refusal(again, run, capsys)
+    assert "a run" in refusal([*again, "--overwrite"], run, capsys)
+
+
+def test_a_run_with_welds_is_replayed_with_the_joint_held(tmp_path: Path) -> None:
+    file = shortened_demo(tmp_path / "demo", 200) / "quadruped.yaml"
+    for path in file.parent.glob("*.npz"):
+        with np.load(path) as arrays:
+            log = dict(arrays)
+        kept = log["joint_names"] != "rear_right_knee"
+        of_joints = {name: log[name][:, kept] for name in ("joint_position", "joint_torque")}
+        np.savez(path, **(log | of_joints | {"joint_names": log["joint_names"][kept]}))
+    weld = [
+        "robot.weld={rear_right_knee: -1.65}",  # its mean angle in these samples
+        "estimator={name: consistent, ridge: 0.001}",
+        "sensors.on_base_lost=warn",
+        f"output={tmp_path / 'run'}",
+    ]
+    assert main(["identify", str(file), *weld]) == 0
+    found = replay(tmp_path / "run", file.parent / "sway_test.npz", window=0.1)
+    assert "rear_right_knee" not in found.joint_names
+    ends = found.at(0.1)
+    assert ends["joints [rad]"].identified < 0.05
+    assert ends["base tilt [rad]"].identified < 0.05
+
+
+def test_a_flat_contact_without_spheres_is_refused_with_what_a_replay_can_stand_on() -> None:
+    urdf = DEMO / "quadruped.urdf"
+    with pytest.raises(ConfigError, match=r"contacts: trunk: flat, .*quadruped\.urdf.* point contacts"):
+        _feet([Contact("trunk", "flat")], urdf)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from torchid.commands.sample import sample
 from torchid.errors import ConfigError
 from torchid.fitting.posterior import POSTERIOR
 from torchid.parameters import consistency_margin
+from torchid.terminal.identification import sample_lines
 
 pytestmark = pytest.mark.filterwarnings("ignore:identified:torchid.errors.TorchidWarning")
 
@@ -105,3 +107,33 @@ def test_runs_without_a_posterior_are_refused_with_advice(run: Path, tmp_path: P
         sample(tmp_path)
     with pytest.raises(torchid.TorchidError, match="none: RUN: no such file or folder; accepted: a run of this"):
         torchid.PosteriorSampler(tmp_path / "none")
+
+
+def test_the_answer_says_that_the_prior_is_too_narrow_and_what_fits(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = sample(run, 20)
+    posterior = drawn.fitted.posterior
+    light = posterior.nominal.copy()
+    light.reshape(-1, 12)[:, :10] *= 0.3  # bodies weigh three times what their file says
+    wrong = replace(drawn, fitted=replace(drawn.fitted, posterior=replace(posterior, nominal=light)))
+    assert drawn.fitted.nominal_error is not None
+    assert "too narrow" not in " ".join(sample_lines(drawn, 100))
+    text = " ".join(" ".join(sample_lines(wrong, 100)).split())
+    found = wrong.fitted.nominal_error
+    assert found is not None
+    assert found.value > 0.6
+    assert f"bodies are off the robot file by {100.0 * found.value:.0f} %" in text
+    assert "--prior-error auto" in text
+
+
+def test_files_that_stand_there_stay_without_overwrite(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "s.npz"
+    sample(run, 5, output=out)
+    before = out.read_bytes()
+    with pytest.raises(ConfigError, match="--overwrite"):
+        sample(run, 6, output=out)
+    assert out.read_bytes() == before
+    sample(run, 6, output=out, overwrite=True)
+    with np.load(out) as arrays:
+        assert len(arrays["samples"]) == 6

@@ -20,10 +20,12 @@ from walking import MACHINES, recorded, truth
 
 from torchid.cli import main
 from torchid.commands.check import check_experiment
+from torchid.config import load_config
 from torchid.errors import ConfigError, InputError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, write_log
 from torchid.problem.contact_detection import DetectionConfig
+from torchid.reading.log_reader import LogReader
 
 MACHINE = MACHINES["quadruped"]
 FEET = [{"frame": name, "type": "point"} for name in MACHINE.feet]
@@ -174,3 +176,40 @@ def test_a_standing_go2_without_an_imu_is_predicted_better_than_by_its_urdf(tmp_
     metrics = standing_go2(tmp_path)
     assert metrics["test"]["nullspace_rms_relative"] < 0.40
     assert metrics["test_nominal"]["nullspace_rms_relative"] > 0.41
+
+
+def test_the_checks_reject_a_log_in_which_nothing_stands(written: Written) -> None:
+    def in_the_air(log: Log) -> Log:
+        return replace(log, **NO_BASE, contact_active=np.zeros_like(value(log.contact_active)))
+
+    checked = check_experiment(written(in_the_air, base_motion="contacts"))[0]
+    (finding,) = [one for one in checked.findings if one.name == "does not fit"]
+    assert finding.found.startswith("no contact stands in any sample")
+
+
+def test_samples_near_changes_of_detected_contacts_are_dropped(written: Written) -> None:
+    counts = []
+    for margin in (0.0, 0.05):
+        file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts={"margin_s": margin})
+        setup = set_up(load_config(file))
+        counts.append(len(LogReader(setup).read(setup.config.logs.train, setup.sensors)[0]))
+    assert counts[1] < counts[0] - 50
+
+
+def refused_settings(folder: Path, contacts: list[dict[str, Any]], **robot: Any) -> str:
+    settings = changed(
+        robot={"urdf": str(DEMO / "quadruped.urdf")} | robot,
+        contacts=contacts,
+        preprocessing={"base_motion": "contacts"},
+    )
+    np.savez(folder / "a.npz")
+    return refused(lambda: set_up(load(folder / "x.yaml", settings)), "preprocessing.base_motion: ", ConfigError)
+
+
+def test_contacts_that_can_never_say_how_the_base_stands_are_refused(tmp_path: Path) -> None:
+    assert "the experiment has none; accepted: three point feet" in refused_settings(tmp_path, [])
+    assert "the experiment has point front_left_foot, point" in refused_settings(tmp_path, FEET[:2])
+    assert "robot.fixed_base is true" in refused_settings(tmp_path, FEET, fixed_base=True)
+    set_up(load(tmp_path / "y.yaml", changed(
+        robot={"urdf": str(DEMO / "quadruped.urdf")}, contacts=FEET[:3], preprocessing={"base_motion": "contacts"},
+    )))  # fmt: skip

@@ -123,3 +123,13 @@ def test_mistakes_are_answered_in_a_line(
     assert main(["identify", str(folder / "experiment.yaml"), f"output={folder / 'x'}", *settings]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert said in line
+
+
+def test_samples_have_friction_at_rest_of_at_least_coulomb_friction(folder: Path) -> None:
+    assert main(["sample", str(folder / "run"), "--count", "200", "--output", str(folder / "samples.npz")]) == 0
+    with np.load(folder / "samples.npz") as samples:
+        named = dict(zip(samples["names"].tolist(), samples["samples"].T, strict=True))
+    at_rest = np.array([x for name, x in named.items() if name.startswith("Stribeck friction of ")])
+    assert at_rest.shape == (2, 200)
+    assert at_rest.min() >= 0.0
+    np.testing.assert_allclose(at_rest.mean(axis=1), AT_REST, rtol=0.15)

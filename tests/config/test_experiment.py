@@ -375,3 +375,10 @@ def test_a_file_that_cannot_be_read_is_named(file: Path) -> None:
     file.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="YAML: not readable"):
         load_config(file)
+
+
+def test_noise_by_axis_is_read_back_as_it_was(file: Path) -> None:
+    config = load(file, LEAST, "sensors.noise.base_force=[60, 50, 3]", "sensors.noise.base_moment=2")
+    assert (config.sensors.noise.base_force, config.sensors.noise.base_moment) == ((60.0, 50.0, 3.0), 2.0)
+    file.write_text(dump_config(config))
+    assert load_config(file) == config

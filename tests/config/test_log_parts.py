@@ -158,3 +158,20 @@ def test_several_files_are_one_log_whose_name_says_which(folder: Path) -> None:
 def test_several_files_that_make_no_log_are_refused(folder: Path, entry: dict[str, Any], found: str) -> None:
     with pytest.raises((ConfigError, UnknownNameError), match=found):
         load(folder, train=[entry])
+
+
+def test_a_range_without_quotes_in_a_list_is_refused_with_how_to_write_it(folder: Path) -> None:
+    accepted = 'names with brackets take quotes in a list: ["walk.npz[0:30]"]'
+    with pytest.raises(ConfigError) as raised:
+        load(folder, "logs.train=[a.npz[0:3]]", train=["a.npz"])
+    assert accepted in str(raised.value)
+    (folder / "other.yaml").write_text("logs: {train: [a.npz[0:3]]}\n")
+    with pytest.raises(ConfigError) as raised:
+        load_config(folder / "other.yaml")
+    assert accepted in str(raised.value)
+
+
+def test_a_pattern_whose_range_is_the_end_of_a_file_is_refused(folder: Path) -> None:
+    (folder / "a.npz[0:3]").touch()
+    with pytest.raises(ConfigError, match=r"a.npz\[0:3\] is a file that it matches without one"):
+        load(folder, train=["*.npz[0:3]"])

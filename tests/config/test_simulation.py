@@ -176,3 +176,9 @@ def test_a_file_that_is_no_simulation_is_named(file: Path) -> None:
         load(file, f"<robot name='arm'>{'<link/>' * 9}</robot>")
     with pytest.raises(ConfigError, match=r"'feet=\[{frame: l_sole}, {frame: r_sole}\]'"):
         load(file, LEAST, "feet[0].frame=l_sole")
+
+
+@pytest.mark.parametrize("name", ["", ".hidden", "a/b", "../a", "a b", "a\n", "-a", "x" * 101])
+def test_a_motion_whose_name_is_no_file_name_is_refused(file: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match="motions.0.name: "):
+        load(file, motion(name=name))

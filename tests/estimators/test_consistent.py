@@ -154,3 +154,21 @@ def test_a_prior_of_matter_refuses_nominal_bodies_that_do_not_exist(prior: Prior
         nominal = np.append(parameters.inertial_vector(1.0, np.zeros(3), inertia), [0.0, 0.0])
         with pytest.raises(InputError, match="body 0"):
             Consistent(1e-2, prior).solve(replace(problem, nominal=nominal))
+
+
+@all_priors
+def test_what_the_conditions_cost_is_stated(prior: Prior) -> None:
+    """Against the least objective without conditions, found by a general optimizer."""
+    problem, scale = active_case(1, bodies=1, rows=9)
+    nominal = problem.nominal.reshape(scale.shape)
+    estimate = Consistent(1e-2, prior).solve(problem)
+    if prior == "entropic":  # whose domain is a condition
+        assert estimate.unconstrained is None
+        assert estimate.increase is None
+        return
+    found = minimize(
+        lambda x: objective(prior, 1e-2, problem, nominal + scale * x), np.zeros(12), options={"gtol": 1e-9}
+    )
+    assert estimate.unconstrained == pytest.approx(found.fun, rel=1e-7)
+    assert estimate.increase == pytest.approx(estimate.objective - found.fun, rel=1e-5)
+    assert estimate.increase > 0.01 * estimate.objective  # something is active

@@ -17,6 +17,7 @@ from physical import (
     random_bodies,
     random_case,
 )
+from scipy.optimize import nnls
 
 from torchid.errors import InputError, NumericalWarning
 from torchid.estimators import Conditions, Consistent, Enclosure, Mirror, violations
@@ -150,3 +151,23 @@ def test_what_is_not_free_is_taken_into_account(prior: Prior) -> None:
     np.testing.assert_allclose(
         alone.phi / only.scale, held.phi[:12] / only.scale, rtol=0.0, atol=1e-5
     )  # sqrt(gap / ridge)
+
+
+def test_bounds_that_meet_hold_a_number() -> None:
+    """The known mass of one body."""
+    problem, scale = active_case(2)
+    lower, upper = np.full(scale.shape, -np.inf), np.full(scale.shape, np.inf)
+    lower[0, 0] = upper[0, 0] = 1.25 * problem.nominal[0]
+    estimate = Consistent(1e-3, conditions=Conditions(lower=lower, upper=upper)).solve(problem)
+    assert estimate.phi[0] == pytest.approx(lower[0, 0], rel=1e-7)
+
+
+@all_priors
+def test_friction_alone_can_be_free(prior: Prior) -> None:
+    problem, _ = active_case(0)
+    free = np.arange(24) % 12 >= 10
+    estimate = Consistent(1e-6, prior).solve(replace(problem, free=free))
+    A, b = problem.A[:, free], problem.b - problem.A[:, ~free] @ problem.nominal[~free]
+    weight = np.sqrt(1e-6 * problem.rows)
+    stacked, right = np.vstack([A, weight * np.eye(4)]), np.append(b, weight * problem.nominal[free])
+    np.testing.assert_allclose(estimate.phi[free], nnls(stacked, right)[0], rtol=0.0, atol=1e-6)

@@ -182,3 +182,22 @@ def test_what_no_condition_is_near_follows_what_a_bound_cuts_off() -> None:
     np.testing.assert_allclose(friction.mean(), mean, rtol=0.03)
     np.testing.assert_allclose((mass + friction).mean(), GOOD[0, 0] + 0.05, atol=1e-4)
     np.testing.assert_allclose((mass + friction).std(), 0.002, rtol=0.03)
+
+
+def test_what_the_data_do_not_see_is_as_wide_as_the_prior() -> None:
+    posterior = posterior_of(nothing_seen(GOOD), Conditions())
+    deviations, _ = drawn(posterior, 20_000, prior_error=0.1)
+    phi = parameters_of(posterior, deviations)[:, 0]
+    np.testing.assert_allclose(phi[:, 0].std(), 0.1 * GOOD[0, 0], rtol=0.03)
+    np.testing.assert_allclose(phi[:, :10].mean(axis=0), GOOD[0, :10], atol=0.02 * SCALE[0, 0])
+
+
+def test_blocks_that_disagree_widen_the_posterior_along_what_they_disagree_on() -> None:
+    problem = replace(nothing_seen(GOOD), A=np.eye(12) * np.arange(1, 13) / SCALE, b=np.zeros(12), rows=12)
+    deviations = np.zeros((3, 12))
+    deviations[:, 0] = 5.0 * SCALE[0, 0] / np.sqrt(3.0)  # five times what noise of 1 leaves
+    rows, _ = whitened_rows(problem, 1.0, deviations)
+    covariance = np.linalg.inv(rows.T @ rows)
+    expected = SCALE[0] / np.arange(1, 13)
+    expected[0] *= 5.0
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), expected, rtol=1e-9)

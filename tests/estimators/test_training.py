@@ -231,3 +231,36 @@ def test_a_descent_taken_up_again_after_any_epoch_is_the_uninterrupted_one_to_th
         estimate = resumed.estimate()
         np.testing.assert_array_equal(estimate.phi, final.phi)
         assert (estimate.best_epoch, estimate.objective) == (final.best_epoch, final.objective)
+
+
+def test_early_stopping_goes_on_where_it_was() -> None:
+    w, held_out = arm(), half_way()
+    settings = Sgd(RIDGE, epochs=60, patience=4, optimizer={"name": "Adam", "lr": 0.02}, schedule=None)
+
+    def new() -> Trainer:
+        return Trainer(settings, w.problem, w.batches, held_out.batches)
+
+    plain = new()
+    states: dict[int, Any] = {}
+    final = plain.run(lambda epoch: states.update({epoch.number: plain.state_dict()}))
+    for start in (final.best_epoch - 1, final.best_epoch + 2, final.epochs):
+        resumed = new()
+        resumed.load_state_dict(states[start])
+        assert resumed.finished == (start == final.epochs)
+        estimate = resumed.run()
+        assert (estimate.epochs, estimate.best_epoch) == (final.epochs, final.best_epoch)
+        np.testing.assert_array_equal(estimate.phi, final.phi)
+
+
+def test_a_schedule_by_plateaus_goes_by_the_held_out_loss() -> None:
+    w = arm()
+    schedule = {"name": "ReduceLROnPlateau", "patience": 0, "factor": 0.5, "threshold": 0.0}
+    trainer = Trainer(Sgd(RIDGE, epochs=20, schedule=schedule), w.problem, w.batches, half_way().batches)
+    epochs: list[Epoch] = []
+    trainer.run(epochs.append)
+    rate, best = 0.05, np.inf
+    for epoch in epochs:
+        assert epoch.learning_rate == rate
+        rate = rate if epoch.held_out < best else rate / 2.0
+        best = min(best, epoch.held_out)
+    assert rate < 0.01

@@ -11,7 +11,7 @@ import pytest
 from delays import DELAY, NOISE, STEP, arm, motion, recorded
 from motions import value
 
-from torchid.errors import LogError
+from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.separable import EARLIEST_DELAY, LATEST_DELAY, DelayChoice, choose_delay
@@ -111,3 +111,28 @@ def test_a_log_with_its_delay_has_the_torques_that_act_at_its_stamps(delay: floa
     np.testing.assert_allclose(acting.joint_torque[10:-10], expected[10:-10], rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(acting.joint_torque, expected, rtol=0.0, atol=1e-3)  # not-a-knot ends
     assert with_delayed_torques(log, 0.0) is log
+
+
+def test_a_delay_reaches_across_no_break_of_a_log_and_knows_nothing_beside_what_was_not_recorded() -> None:
+    log = recorded()
+    broken = log.select(np.r_[0:600, 1000:1600])
+    acting = with_delayed_torques(broken, DELAY)
+    assert len(acting) == 1198, "the first sample of each part has no torque of before"
+    assert set(broken.time[[0, 600]]).isdisjoint(acting.time)
+    torque = value(log.joint_torque).copy()
+    torque[700, 0] = np.nan
+    lacking = with_delayed_torques(replace(log, joint_torque=torque), DELAY)
+    known = np.isfinite(lacking.joint_torque)
+    assert (~known).sum() == 2
+    assert known[:, 1].all()
+    with pytest.raises(LogError, match="no longer than actuators.delay of 9 s"):
+        with_delayed_torques(log, 9.0)
+
+
+@pytest.mark.parametrize("beyond", [EARLIEST_DELAY - 0.003, LATEST_DELAY + 0.003])
+def test_a_delay_beyond_those_that_are_tried_is_said_to_be_at_their_end(beyond: float) -> None:
+    end = min(max(beyond, EARLIEST_DELAY), LATEST_DELAY)
+    with pytest.warns(TorchidWarning, match=f"{end:g} s or beyond; are torques and positions stamped by the same"):
+        found = chosen(recorded(beyond))
+    assert found.found == end
+    assert "an end of what is tried: the best may lie beyond" in str(found)

@@ -119,3 +119,14 @@ def test_errors_of_gains_move_parameters_as_a_fit_of_other_readings_says() -> No
         after = fitter.fit(compress_parts([replace(log, torque=gained)], fitter.builder)).estimate.phi
         np.testing.assert_allclose(found[joint], after - before, atol=1e-8 * np.abs(after - before).max(), rtol=1e-6)
     assert not len(gain_deviations([log], fitter, ExtraTerms(scales={"joint_torque": "all"}), 0.01))
+
+
+def test_a_term_that_errors_of_gains_explain_is_not_adopted() -> None:
+    """Torques of the weight change with the position as those of a spring do, and are 5 % off here."""
+    log = recorded(3, gains=0.05, reach=0.3)
+    assert choose_terms(reading(log), TERMS).adopted
+    assert not choose_terms(reading(log, gain=0.05), TERMS).adopted
+    there = recorded(3, rotor=0.3, gains=0.05)
+    assert set(choose_terms(reading(there, gain=0.05), TERMS).adopted) == {"armature"}
+    hidden = recorded(6, rotor=0.05, gains=0.05, reach=0.3)  # by these errors
+    assert set(choose_terms(reading(hidden, gain=0.05), TERMS).adopted) == {"armature"}

@@ -19,10 +19,11 @@ from torchid.fitting.noise import (
     GroupNoise,
     Misfit,
     UnfittedFriction,
+    resting_joints,
     unfitted_friction,
 )
 from torchid.parameters import FRICTION
-from torchid.problem import bind_log
+from torchid.problem import ExtraTerms, bind_log
 
 UNITS = (("N m", "N m s/rad"), ("N", "N s/m"))
 UNPHYSICAL = "ignore::torchid.errors.TorchidWarning"
@@ -124,3 +125,36 @@ def test_friction_that_the_model_lacks_is_said_before_all_else(
     said = " ".join(told["false"][1].split())
     assert "attention friction, compliance or contacts are missing" in said
     assert "unexplained residuals are 11 times" in said
+
+
+def test_joints_that_rest_are_told_with_their_share_where_friction_goes_with_the_sign() -> None:
+    arm, count = torchid.load_robot(UR5, fixed_base=True), 3000
+    t, rng = np.arange(count) / 100.0, np.random.default_rng(0)
+    velocity = np.cos(rng.uniform(3.0, 9.0, arm.n) * t[:, None])
+    velocity[1000:2200, 1] = 1e-3 * rng.normal(size=1200)  # 40 % of the time
+    velocity[:, 4] = 1e-3 * rng.normal(size=count)  # which nobody knows from noise
+    directions = np.sign(velocity) * (np.arange(arm.n) != 4)
+    log = torchid.Log(
+        "arm.npz",
+        t,
+        joint_names=arm.joint_names,
+        joint_position=velocity,
+        joint_velocity=velocity,
+        joint_acceleration=velocity,
+        joint_torque=np.zeros_like(velocity),
+        joint_direction=directions,
+    )
+    samples, names = bind_log(log, arm, []), arm.joint_names
+    sensors = torchid.named_sensors("joints", arm.n, 0, torchid.SensorNoise(0.3, 1.0, 0.1))
+    builder = torchid.RowBuilder(arm, [], sensors)
+    free, fixed = (
+        torchid.linear_problem(torchid.compress([samples], builder), builder, arm, friction=x) for x in (True, False)
+    )
+    found = resting_joints(free, arm, builder, [samples[:1200], samples[1200:]])
+    assert list(found) == [names[4], names[1]]
+    assert found[names[4]] == 1.0
+    slow = 2.0 / np.pi * np.arcsin(0.1 * np.sqrt(0.3))  # of a sine, beside what rests 40 % of the time
+    assert found[names[1]] == pytest.approx(0.4 + 0.6 * slow, abs=0.003)
+    assert resting_joints(fixed, arm, builder, [samples]) == {}
+    wide = torchid.RowBuilder(arm, [], sensors, ExtraTerms(sign_width=0.02))
+    assert resting_joints(free, arm, wide, [samples]) == {}

@@ -107,3 +107,20 @@ def test_swing_phases_tell_offsets_from_mass(biped_folder: Path, mount: str, kin
     assert np.abs(errors).max() < force
     assert max(x.inflation for x in forces) < 0.5 * INFLATION_LIMIT
     assert total_mass(found.assembly, found.estimate).separable
+
+
+SQUATTING = ("squat_0.5hz", "squat_1.0hz", "squat_2.0hz")
+
+
+@pytest.mark.parametrize("kind", ["exact", "logs"])
+@pytest.mark.parametrize("mount", ["local", "ankles"])
+def test_feet_that_never_leave_the_ground_do_not_and_that_is_said_by_a_wide_margin(
+    biped_folder: Path, mount: str, kind: str
+) -> None:
+    found, _ = identified(biped_folder, kind, SQUATTING, mount)
+    vertical = [x for x in found.extras if x.extra.component == "fz"]
+    assert len(vertical) == 2 * len(SQUATTING)
+    assert min(x.inflation for x in vertical) > 30.0 * INFLATION_LIMIT
+    assert not any(x.separable for x in found.extras)
+    assert not total_mass(found.assembly, found.estimate).separable
+    assert all(x.confounded_with for x in vertical)

@@ -261,3 +261,12 @@ def test_offsets_of_sensors_are_found_among_outliers(kind: str) -> None:
     spoilt = [x.value - offsets[x.log, x.extra.name] for x in first.extras]
     errors = [x.standard_error for x in fit.extras]
     assert np.sqrt(np.mean((np.array(spoilt) / errors) ** 2)) > 10.0
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_the_usual_tuning_has_95_percent_efficiency_on_gaussian_noise(kind: str) -> None:
+    u = torch.linspace(-12.0, 12.0, 200_001, dtype=torch.float64)
+    density = torch.exp(-u.square() / 2.0) / np.sqrt(2.0 * np.pi) * (u[1] - u[0])
+    loss = RobustLoss.named(kind, None)
+    variance = (density * (loss.weight(u) * u).square()).sum() / (density * loss.slope(u)).sum() ** 2
+    assert 1.0 / float(variance) == pytest.approx(0.95, abs=5e-4)

@@ -14,6 +14,7 @@ from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.separable import StribeckChoice, choose_stribeck
 from torchid.logs import Log
+from torchid.logs.dry_friction import mean_stribeck
 from torchid.logs.preprocess import preprocess
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
 from torchid.problem.compression import compress_in_blocks
@@ -86,3 +87,25 @@ def test_coulomb_friction_alone_has_no_velocity(estimator: LeastSquares | Consis
     found = chosen(recorded(0.1, NOISE, at_rest=np.zeros(2)), 10.0, estimator=estimator)
     assert found.velocity is None
     assert str(found).startswith("none: friction at rest is not significantly beyond Coulomb friction")
+
+
+def test_friction_at_rest_is_never_less_than_coulomb_friction_of_a_consistent_fit() -> None:
+    log = bind_log(recorded(0.13, at_rest=-0.5 * AT_REST), arm()[0], ())
+    at_rest = []
+    for estimator in (LeastSquares(), Consistent(conditions=Conditions())):
+        fitter = fitter_of(ExtraTerms(stribeck=0.13), estimator)
+        at_rest.append([x.value for x in fitter.fit(compress_in_blocks([log], fitter.builder)).extras])
+    np.testing.assert_allclose(at_rest[0], -0.5 * AT_REST, rtol=1e-6)
+    np.testing.assert_allclose(at_rest[1], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("width", "off"), [(None, 1.5e-4), (0.02, 2e-6)])
+def test_the_mean_over_a_step_is_that_of_many_velocities_between(width: float | None, off: float) -> None:
+    rng, velocity = np.random.default_rng(0), 0.1
+    before = rng.uniform(-0.2, 0.2, 200)
+    after = before + rng.uniform(-0.1, 0.1, 200)
+    between = before + (after - before) * ((np.arange(20000) + 0.5) / 20000)[:, None]
+    sign = np.sign(between) if width is None else np.tanh(between / width)
+    expected = (sign * np.exp(-np.square(between / velocity))).mean(axis=0)
+    found = mean_stribeck(np.stack([before, after]), width, velocity)[0]
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=off)

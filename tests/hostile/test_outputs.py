@@ -234,3 +234,13 @@ def test_a_folder_is_claimed_by_one_process_until_that_ends(tmp_path: Path) -> N
     with claim_folder(tmp_path / "x" / "run"):
         pass
     assert list((tmp_path / "x").iterdir()) == []
+
+
+def test_the_folder_of_the_logs_and_that_of_the_call_are_not_replaced(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(place / "demo")
+    for output in (".", "..", str(place / "demo"), "", "sway_train.npz"):
+        verdict = judged(output, lambda output=output: main(identify(place, output, "overwrite=true")), place / "demo")
+        assert not verdict.faults
+        assert verdict.outcome == "refused"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from demo import shortened_demo
-from hostile import examined
+from hostile import examined, judged
 from hostile_runs import parameter_files
 from hostile_settings import DOCUMENTS
 
@@ -68,3 +69,15 @@ def test_a_run_with_hostile_settings_is_refused(place: Path, share: int) -> None
     tally = examined("config.yaml of runs", cases(), lambda _: main(evaluation(place)), place)
     assert tally.faults == []
     assert tally.share("refused") == 1.0
+
+
+@pytest.mark.parametrize("name", ["..npz", "...npz", "....npz"])
+def test_an_evaluation_never_takes_the_place_of_its_run(place: Path, name: str) -> None:
+    """The folder of `...npz` would be the run's `evaluation/..`."""
+    shutil.copy(place / "demo" / "sway_test.npz", place / name)
+    arguments = ["evaluate", str(place / "run"), "--log", str(place / name)]
+    verdict = judged(name, lambda: main(arguments), place, [place / "run" / "evaluation"])
+    (place / name).unlink()
+    assert not verdict.faults
+    assert (place / "run" / "parameters.json").is_file()
+    assert verdict.outcome == ("accepted" if name == "....npz" else "refused")

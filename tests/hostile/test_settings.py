@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import yaml
-from hostile import examined
+from hostile import examined, judged
 from hostile_settings import BASE, damaged, documents, overrides, wrong_values
 
 from torchid.config import load_analysis, load_config
@@ -75,3 +75,12 @@ def test_aliases_are_for_sharing_and_not_for_multiplying() -> None:
     check_yaml("a: " + "[" * (MAX_DEPTH - 1) + "]" * (MAX_DEPTH - 1))
     with pytest.raises(ValueError, match="nested more than"):
         check_yaml("a: " + "[" * MAX_DEPTH + "]" * MAX_DEPTH)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    import os
+
+    os.mkfifo(tmp_path / "pipe")
+    verdict = judged("a pipe", lambda: load_config(tmp_path / "pipe"), tmp_path)
+    assert verdict.outcome == "refused"
+    assert not verdict.faults

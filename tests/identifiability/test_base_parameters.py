@@ -230,3 +230,14 @@ def test_a_hinge_hides_mass_first_moment_along_it_and_one_inertia_as_textbooks_s
 def test_values_that_fall_without_a_step_are_told() -> None:
     with pytest.warns(NumericalWarning, match="rank 5: the next singular value is only 100 times smaller"):
         assert rank_and_gap(np.geomspace(1.0, 1e-20, 11), tolerance=1e-9) == (5, pytest.approx(100.0))
+
+
+def test_of_a_bolted_hinge_across_gravity_four_numbers_are_seen(tmp_path: Path) -> None:
+    elements = [BASE, link("arm"), joint("elbow", "base", "arm", extra='<axis xyz="0 1 0"/>')]
+    robot = load(write(tmp_path, *elements), fixed_base=True)
+    base = base_parameters(flying(robot))
+    assert format_base_parameters(base, robot.body_names) == ["mcx[arm]", "mcz[arm]", "Iyy[arm]", "fc[arm]", "fv[arm]"]
+    assert unobservable_parameters(base, robot.body_names) == [
+        "base: m, mcx, mcy, mcz, Ixx, Ixy, Ixz, Iyy, Iyz, Izz",
+        "arm: m, mcy, Ixx, Ixy, Ixz, Iyz, Izz",
+    ]

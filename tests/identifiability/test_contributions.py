@@ -223,3 +223,15 @@ def test_sensors_are_ranked_by_what_a_fit_without_them_lacks(unknown: str) -> No
         rest, _ = knowledge(with_sensors(w, torques, wrenches), w.logs)
         assert sensor.bits == pytest.approx((whole - rest).bits, rel=1e-7)
         assert sensor.determined == pytest.approx((whole - rest).determined, rel=1e-7)
+
+
+def test_the_share_of_the_data_is_how_far_the_estimate_follows_the_truth() -> None:
+    rng = np.random.default_rng(0)
+    A, scale = rng.normal(size=(20, 4)) @ rng.normal(size=(4, 6)), 10.0 ** rng.uniform(-1.0, 1.0, 6)
+    problem = replace(problem_of(A / scale, np.zeros(20)), scale=scale, nominal=rng.normal(size=6))
+    for ridge in (0.0, 0.1, 3.0):
+        shares = LeastSquares(ridge).solve(problem).data_share
+        for p in range(6):
+            unit = np.eye(6)[p]
+            here, there = (LeastSquares(ridge).solve(replace(problem, b=problem.A @ x)) for x in (0.0 * unit, unit))
+            assert (there.phi - here.phi)[p] == pytest.approx(shares[p], abs=1e-10)

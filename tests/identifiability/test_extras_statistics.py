@@ -15,6 +15,8 @@ from unknowns import fit
 from urdfs import BASE, inertial, joint, link, write
 from welded import SENSORS, machine
 
+from torchid.identifiability.confounding import INFLATION_LIMIT
+from torchid.logs import Log
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.elimination import free_parameters
@@ -142,3 +144,23 @@ def test_95_percent_intervals_of_offsets_hold_the_truth_that_often(tmp_path: Pat
         hits += [abs(x.value) < 1.96 * x.standard_error for x in found.extras]
     assert len(hits) == 200 * len(logs)
     assert 0.93 < np.mean(hits) < 0.97
+
+
+@pytest.mark.parametrize("acceleration", [0.0, 0.3, 0.9, 1.1, 3.0])
+def test_an_offset_and_a_weight_are_as_far_apart_as_the_acceleration_is_from_constant(
+    tmp_path: Path, acceleration: float
+) -> None:
+    """Of f = m (a + g) + o: the error of o grows by rms(a + g) / std(a) if m is not known."""
+    robot, rng = slide(tmp_path), np.random.default_rng(4)
+    a = acceleration * rng.choice([-1.0, 1.0], (200, 1))
+    s = a + 9.81
+    log = Log("lift.npz", np.arange(200) * 0.01, ("lift",), 0 * a, 0 * a, a, 2.0 * s + 7.0)
+    sensors = named_sensors("joints", 1, 0)
+    (found,) = fit(robot, (), sensors, ExtraTerms(offsets={"joint_torque": "all"}), [bind_log(log, robot, ())]).extras
+    if acceleration:
+        assert found.inflation == pytest.approx(np.sqrt((s**2).mean()) / a.std(), rel=1e-6)
+        assert found.value == pytest.approx(7.0, abs=1e-6)
+    assert found.separable == (acceleration > 9.81 / INFLATION_LIMIT)
+    if not found.separable:
+        assert found.confounded_with == ("arm m",)
+        assert (found.standard_error == np.inf) == (acceleration == 0.0)

@@ -137,3 +137,12 @@ def test_folds_are_blocks_and_without_three_blocks_there_is_no_scatter() -> None
         short = split_into_folds([exact[:count]], fitter.builder)
         found = fitter.fit(compress_in_blocks(short, fitter.builder)).jackknife
         assert (None if found is None else found.blocks) == blocks
+
+
+def test_noise_alone_is_no_lack_of_fit() -> None:
+    samples, fitter, _, rng = scene(400)
+    for _ in range(5):
+        log = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))
+        fit = fitter.fit(compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder))
+        assert fit.jackknife is not None
+        assert 0.8 < (fit.jackknife.lack_of_fit or 0.0) < 1.25

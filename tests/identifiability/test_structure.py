@@ -6,17 +6,19 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from contact_states import BOTH, FEET, LEFT, biped, bipeds
+from contact_states import BOTH, FEET, FLIGHT, LEFT, RIGHT, biped, bipeds
 from synthetic import ANYMAL, G1, PANDA, SOLO12, TIAGO, Array, Oracle, load
 
 from torchid import parameters
 from torchid.identifiability.base_parameters import (
+    base_parameters,
     standing_samples,
     standing_states,
+    structural_problem,
     structural_samples,
 )
 from torchid.regressor import motion_from_state
-from torchid.sensing import Contact
+from torchid.sensing import Contact, named_sensors
 
 # --------------------------------------------------------------------------------------------------------- standing
 
@@ -128,3 +130,19 @@ def test_no_force_whatsoever_depends_on_the_inertia_of_a_foot_that_stands(name: 
     left, right = (robot.link(contact.frame)[0] for contact in contacts)
     assert np.abs(K[:, :, left, parameters.INERTIA]).max() < 1e-12
     assert np.abs(K[:, :, right, parameters.INERTIA]).max() > 1.0
+
+
+def test_a_foot_that_stands_is_the_ground_of_an_arm() -> None:
+    """A free foot would show ten parameters, the first link on it seven.
+
+    To torque sensors the ground shows none, and a link that only turns about an axis fixed in the ground three: two
+    first moments and one inertia. A wrench below the foot adds the ground's mass, its first moments along the level
+    ground and two products of inertia.
+    """
+    robot, contacts = biped("biped")
+    for sensor_set, lost in (("full", 9), ("joints", 14)):
+        sensors = named_sensors(sensor_set, robot.n, len(contacts))
+        for states, standing in (([BOTH], 2), ([LEFT], 1), ([FLIGHT], 0), ([LEFT, RIGHT], 0)):
+            base = base_parameters(structural_problem(robot, contacts, sensors, states, friction=False))
+            assert base.rank == 10 + 7 * robot.n - standing * lost, (sensor_set, states)
+            assert base.gap > 1e12

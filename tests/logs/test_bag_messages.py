@@ -250,3 +250,14 @@ def test_contacts_without_a_wrench_say_themselves_when_they_touch(tmp_path: Path
     nan = [("/w", s, WRENCH, wrench(s, np.full(6, np.nan), "c")) for s in map(int, STAMPS)]
     topics = {"contact_wrenches": {"c": "/w"}, "contact_force_threshold": 5.0}
     assert "/w: a force of NaN in message 0" in refusal(tmp_path / "x.bag", joints_at(STAMPS) + nan, **topics)
+
+
+def test_wrenches_in_a_frame_of_another_name_are_warned_of_unless_that_is_meant(tmp_path: Path) -> None:
+    entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, np.ones(6), "/sensor")) for s in map(int, STAMPS)]
+    with pytest.warns(TorchidWarning, match=r"/w: frame '/sensor', taken to be 'sole'; logs.topics.contact_wrenches"):
+        read_messages(tmp_path / "x.mcap", entries, contact_wrenches={"sole": "/w"}, contact_force_threshold=1.0)
+    meant = {"sole": {"topic": "/w", "frame": "sensor"}}
+    read_messages(tmp_path / "x.mcap", entries, contact_wrenches=meant, contact_force_threshold=1.0)
+    read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": {"topic": "/w", "frame": "/sensor"}})
+    with pytest.warns(TorchidWarning, match="/w: frame '/sensor', taken to be 'other'"):
+        read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": {"topic": "/w", "frame": "other"}})

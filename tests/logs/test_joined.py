@@ -339,3 +339,16 @@ def test_arrays_of_one_file_that_have_stamps_of_their_own_are_those_of_two_files
         open_log_blocks(tmp_path / "one.npz", None, columns),
     ):
         pass
+
+
+def test_quaternions_of_another_file_are_interpolated_without_sign_flips_and_normalised(tmp_path: Path) -> None:
+    time, other = np.arange(300) / 240.0, np.arange(150) / 100.0
+    quat = smooth(other, 2.0)["base_quat_wxyz"] * np.where(np.arange(150) % 7 < 3, 1.0, -1.0)[:, None]
+    joints = smooth(time, 2.0)["joint_position"]
+    np.savez(tmp_path / "joints.npz", time=time, joint_names=["a", "b"], joint_position=joints)
+    np.savez(tmp_path / "base.npz", time=other, base_quat_wxyz=quat)
+    found = read_log(tmp_path / "joints.npz + base.npz").base_quat_xyzw
+    assert found is not None
+    wanted = np.roll(smooth(time, 2.0)["base_quat_wxyz"], -1, axis=1)
+    assert np.abs(np.abs((found * wanted).sum(axis=1)) - 1.0)[20:-20].max() < 1e-8
+    assert np.abs(np.linalg.norm(found, axis=1) - 1.0).max() < 1e-15

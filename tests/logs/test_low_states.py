@@ -282,3 +282,14 @@ def test_topics_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
         "/lowstate carries unitree_go/msg/LowState; accepted: sensor_msgs/msg/JointState, or logs.topics.low_"
         in message
     )
+
+
+def test_messages_that_are_received_in_another_order_are_sorted_by_their_ticks(tmp_path: Path) -> None:
+    log = moving(GO2, 4)
+    entries = list(low_states(log, GO2))
+    swapped = [
+        (topic, START + 2_000_000 * i, kind, content)
+        for i, (topic, _, kind, content) in enumerate([entries[k] for k in (0, 2, 1, 3)])
+    ]
+    again = read(write(tmp_path / "x.mcap", swapped), robot="go2")
+    np.testing.assert_array_equal(again.joint_position, log.joint_position)

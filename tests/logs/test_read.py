@@ -361,3 +361,20 @@ def test_selecting_samples_takes_the_same_ones_of_every_field(tmp_path: Path) ->
     chosen = log.select(np.array([4, 0]))
     np.testing.assert_array_equal(chosen.joint_position, log.joint_position[[4, 0]])
     assert len(log.select(log.time > 0.025)) == 3
+
+
+def test_pickled_objects_are_refused(tmp_path: Path) -> None:
+    objects = np.array([{}, 1], dtype=object)
+    np.savez(tmp_path / "x.npz", **changed(joint_names=objects))
+    assert "joint_names: Python objects (pickled), references or ragged rows" in log_refusal(tmp_path / "x.npz")
+    ragged = h5py.vlen_dtype(np.float64)
+    with h5py.File(write_arrays(tmp_path / "x.h5", changed(time=None)), "a") as file:
+        file.create_dataset("time", (N,), dtype=ragged)
+    assert "time: Python objects (pickled), references or ragged rows" in log_refusal(tmp_path / "x.h5")
+
+
+def test_a_name_given_twice_in_one_archive_is_refused(tmp_path: Path) -> None:
+    path = write_arrays(tmp_path / "x.npz", file_fields())
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("time.npy", archive.read("time.npy"))
+    assert "occurs twice" in log_refusal(path)

@@ -278,3 +278,13 @@ def test_rows_that_repeat_the_one_before_count_once(tmp_path: Path, suffix: str,
     save(path, twice | {"joint_torque.knee": [7.0, 7.0, 8.0, 8.5, 8.0, 9.0]})
     with pytest.warns(TorchidWarning, match="1 row "), pytest.raises(LogError, match="strictly increasing"):
         read_log(path)
+
+
+@both
+def test_both_quaternion_orders_are_told_apart_by_their_columns(tmp_path: Path, suffix: str) -> None:
+    quat = {"w": [0.5] * 3, "x": [0.1] * 3, "y": [0.7] * 3, "z": [0.5] * 3}
+    for order in ("wxyz", "xyzw"):
+        table = columns(**{f"base_quat_{order}__{axis}": quat[axis] for axis in "zwxy"})
+        log = read_log(save(tmp_path / f"{order}{suffix}", table))
+        assert log.base_quat_xyzw is not None
+        np.testing.assert_allclose(log.base_quat_xyzw[1], [0.1, 0.7, 0.5, 0.5], rtol=0.0, atol=1e-15)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from random_samples import random_samples, sensor_set
+from random_samples import NOISE, random_samples, sensor_set
 from synthetic import PANDA, TALOS, TALOS_FULL, load
 
 import torchid
@@ -234,3 +234,20 @@ def test_long_passes_use_kernels_and_give_the_same_factor(monkeypatch: pytest.Mo
     found = compress([samples], builder).triangle()
     assert builder.compiled is not None
     assert_same_grams(found, expected)
+
+
+def test_a_sensor_in_a_limb_has_rows_of_all_six_components() -> None:
+    robot = load(TALOS_FULL, ft_joints=("wrist_left_ft_joint",))
+    sensors = torchid.named_sensors("full", robot.n, 0, NOISE, len(robot.ft_names))
+    samples = random_samples(robot, [], 70, 1)[0]
+    samples = replace(samples, torque=torch.cat([samples.torque, samples.torque[:, :6]], dim=1))
+    assert assert_same_rows(*builders(robot, [], sensors), samples) == 1
+
+
+def test_a_known_payload_and_smooth_friction_are_in_the_rows() -> None:
+    sensors = sensor_set("joints", QUADRUPED, POINTS)
+    plain, fast = builders(QUADRUPED, POINTS, sensors)
+    samples = random_samples(QUADRUPED, POINTS, 200, 5, states=1)[0]
+    payload = np.random.default_rng(0).normal(size=QUADRUPED.nominal.size)
+    assert assert_same_rows(plain, fast, replace(samples, payload=payload)) == 1
+    assert assert_same_rows(plain, fast, replace(samples, resting=samples.joint_position > 0.0)) == 0, "torch's"

@@ -160,3 +160,9 @@ def test_readings_calibrated_with_the_true_values_are_the_forces(turned: Callabl
             known[:, extra.contact[0], extra.contact[1]] = ideal.active[:, extra.contact[0]]
     assert known.sum() > 100
     np.testing.assert_allclose(value(found.wrench)[known], value(ideal.wrench)[known], rtol=0.0, atol=1e-11)
+
+
+def test_scales_of_plates_are_those_of_what_they_read_about_a_point_of_the_world() -> None:
+    scaled = ("contact_force", "contact_moment")
+    terms, w = ExtraTerms(dict.fromkeys(CHANNELS, "log"), dict.fromkeys(scaled, "log")), world(True, scaled, "plates")
+    assert_recovered(w, fitted(w, sensors_of(w.robot, "full"), terms), terms)

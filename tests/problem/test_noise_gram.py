@@ -250,3 +250,17 @@ def test_parameters_of_noisy_motion_are_no_more_too_small(robot: Robot) -> None:
         errors.append(np.linalg.norm(problem.A @ found - truth) / np.linalg.norm(truth))
     assert errors[0] > 0.02
     assert errors[1] < 0.3 * errors[0]
+
+
+def test_no_more_is_taken_off_than_leaves_a_third(robot: Robot, builder: RowBuilder) -> None:
+    factor = compress([motion(robot, 500, 1.0)], builder)
+    corrected = corrected_triangle(factor, column_prior(builder, robot))
+    R, noise = corrected.R, corrected.noise
+    assert 0 < noise.lost <= noise.combinations
+    assert noise.largest > 1.0 - LEAST_SIGNAL
+    assert "remain near the nominal ones" in str(noise)
+    plain = factor.triangle().numpy()[:, :-1]
+    U, values, Vh = np.linalg.svd(plain, full_matrices=False)
+    kept = values > 1e-9 * values[0]
+    left = np.linalg.svd(R[:, :-1] @ (Vh[kept].T / values[kept]), compute_uv=False)
+    assert left.min() == pytest.approx(np.sqrt(LEAST_SIGNAL), rel=1e-6)

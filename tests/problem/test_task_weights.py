@@ -11,7 +11,7 @@ import torch
 from demo import shortened_demo
 from random_samples import NOISE, random_samples, sensor_set
 from repository import ROOT
-from synthetic import Array
+from synthetic import PANDA, Array, load
 
 import torchid
 from torchid.cli import main
@@ -106,3 +106,12 @@ def test_a_fixed_base_has_no_axes_to_weigh(tmp_path: Path, capsys: pytest.Captur
     arm = ROOT / "configs" / "kuka_lwr4.yaml"
     assert main(["identify", str(arm), "estimator.task_weights={base_force: 2}", f"output={tmp_path / 'run'}"]) == 2
     assert "estimator.task_weights: axes of the base, which is fixed; accepted: joint_torque" in capsys.readouterr().err
+
+
+def test_weights_of_a_bolted_arm_weigh_its_joints() -> None:
+    arm = load(PANDA, fixed_base=True)
+    samples = random_samples(arm, [], 20, 1)[0]
+    sensors, weights = torchid.named_sensors("joints", arm.n, 0, NOISE), np.arange(1.0, arm.n + 1.0)
+    plain, _ = RowBuilder(arm, [], sensors).rows_by_sample(samples, ())
+    weighted, _ = RowBuilder(arm, [], replace(sensors, task_weights=weights)).rows_by_sample(samples, ())
+    torch.testing.assert_close(weighted, torch.from_numpy(weights)[:, None] * plain, rtol=1e-10, atol=1e-12)

@@ -198,3 +198,19 @@ def test_all_columns_follow_from_the_regrouped_ones(urdf: Path, fixed_base: bool
     full = regressor(robot, *state)[..., parameters.INERTIAL]
     B = reduction_matrix(KinematicTree(robot))
     assert_close(reduced_regressor(robot, *state) @ B, full.reshape(*full.shape[:2], -1))
+
+
+def test_tensors_of_another_device_are_refused_by_its_name(small: Robot) -> None:
+    q, v, a = tensors(*random_states(np.random.default_rng(23), small.n, 2))
+    with pytest.raises(TypeError, match="found devices meta, cpu; accepted: one device"):
+        motion_from_state(q.to("meta"), v, a, small.n)
+    with pytest.raises(TypeError, match=r"^v: found meta; accepted: cpu, the module's, which .to\(device\) changes"):
+        Regressor(small)(q, v.to("meta"), a)
+    with pytest.raises(TypeError, match=r"q: found meta; accepted: cpu, the module's, which .to\(device\) changes"):
+        FrameJacobian(small, "c")(q.to("meta"))
+
+
+def test_the_path_of_a_robot_is_no_robot() -> None:
+    for module in (Regressor, LoopJacobian):
+        with pytest.raises(TypeError, match="robot: found str; accepted: what torchid.load_robot returns"):
+            module(str(SOLO12))  # type: ignore[arg-type]

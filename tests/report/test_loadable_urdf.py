@@ -164,3 +164,12 @@ def test_a_run_writes_what_loads(urdf: Path, file: Path | None, feet: tuple[str,
     )
     assert run.violations == []
     assert_loads(tmp_path / "run" / "identified.urdf", float(run.phi[:, 0].sum()))
+
+
+def test_joints_that_move_no_mass_at_all_are_still_refused(tmp_path: Path) -> None:
+    """They have no equation of motion: a file that loads would hide it."""
+    robot = pair(tmp_path, lower="")
+    path = written(robot, tmp_path)
+    assert "boundmass" not in path.read_text()
+    with pytest.raises(ValueError, match="mass and inertia of moving bodies"):
+        mujoco.MjModel.from_xml_path(str(path))

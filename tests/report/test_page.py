@@ -124,3 +124,16 @@ def test_a_run_writes_its_page_with_figures_that_a_browser_shows(
     assert f"torchid report {tmp_path / 'new'} checks the logs" in written
     assert ("data:image/svg+xml;base64," in written) is shown
     assert ("those in PDF are files of their own" in written) is not shown
+
+
+MEGABYTE = 1_000_000
+
+
+def test_it_is_one_file_of_less_than_5_megabytes_that_asks_nobody_for_more(page: str) -> None:
+    own = re.sub(r"data:image/png;base64,[^\"]*", "data:,", page)
+    assert len(page.encode()) < 5 * MEGABYTE
+    assert not re.search(r"https?:|//[a-z]+\.", own.replace("window.hacked", ""))
+    links = re.findall(r"<[a-z][^>]*\s(?:href|src)=[\"']?([^\"'> ]+)", own)
+    assert links
+    assert all(link.startswith(("#", "data:,")) for link in links)
+    assert "default-src 'none'" in own

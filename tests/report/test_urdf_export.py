@@ -240,3 +240,13 @@ def test_a_consistent_fit_of_poor_data_is_taken_by_every_reader(name: str, foot:
         path = exported(robot, impossible, tmp_path)
     with pytest.raises(ValueError, match="A \\+ B >= C"):
         mujoco_model(path, robot)
+
+
+def test_friction_that_is_gone_is_written_and_friction_that_never_was_is_not(tmp_path: Path) -> None:
+    robot = robot_of("machine", tmp_path)
+    phi = robot.nominal.copy()
+    phi[:, parameters.FRICTION] = 0.0
+    root = etree.parse(str(exported(robot, phi, tmp_path))).getroot()
+    found = {joint.get("name"): joint.find("dynamics") for joint in root.findall("joint")}
+    assert dict(found["rail"].attrib) == dict(found["elbow"].attrib) == {"friction": "0.0", "damping": "0.0"}
+    assert found["wrist"] is found["knuckle"] is found["mount"] is None

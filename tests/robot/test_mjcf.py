@@ -14,7 +14,7 @@ pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 import mujoco
 from lxml import etree
 from mujoco_oracle import INERTIA_ROUNDING, IS_MUJOCO_3
-from survey_mjcf import States, difference, survey, torchid_forces
+from survey_mjcf import States, difference, mujoco_forces, survey, torchid_forces
 
 from torchid.errors import InputError, TorchidWarning, UrdfError
 from torchid.report import FittedJoints, identified_robot, identified_urdf
@@ -285,3 +285,42 @@ def test_what_mujoco_multiplies_is_written_with_what_was_identified_to_the_last_
     assert not {"replicate", "attach"} & {str(element.tag) for element in etree.parse(written).iter()}
     assert found.read_again < 1e-13, "identified: every digit"
     assert 1e-9 < found.written < 1e-5, "where bodies are: six digits"
+
+
+@pytest.mark.parametrize(
+    ("actuators", "passive"),
+    [
+        ('<motor joint="j"/>', ("k",)),
+        ('<position jointinparent="k"/>', ("j",)),
+        ('<motor site="s"/>', ()),
+        ("", ()),
+    ],
+)
+def test_joints_of_robots_with_loops_that_no_actuator_drives_have_no_motor(
+    actuators: str, passive: tuple[str, ...], tmp_path: Path
+) -> None:
+    closed = '<connect site1="s" site2="t"/>'
+    assert robot_of(LOOPED.format(closed, actuators), tmp_path, True).passive == passive
+    assert robot_of(LOOPED.format("", actuators), tmp_path, True).passive == (), "as before without loops"
+    assert load_robot(tmp_path / "robot.xml", fixed_base=True, passive=["j"]).passive == ("j",)
+
+
+OTHER = '<worldbody><body name="m" mocap="true"/></worldbody><equality>\n<weld body1="m" body2="b"/></equality>'
+
+
+def test_a_limited_tendon_or_an_inactive_loop_changes_nothing(tmp_path: Path) -> None:
+    tendon = TENDON.replace('stiffness="3"', 'limited="true" range="0 1"')
+    loop = OTHER.replace("<weld", '<weld active="false"')
+    robot = robot_of(BODY.format("", HINGE.format(""), tendon + loop), tmp_path, True)
+    states = States.random(robot)
+    own = torchid_forces(robot, robot.nominal, robot.armature, states)
+    assert difference(own, mujoco_forces(MjcfModel(robot.path), robot, states)) < 1e-13
+
+
+def test_springs_that_push_or_move_several_joints_are_named(tmp_path: Path) -> None:
+    robot = robot_of(BOLTED, tmp_path, True)
+    fitted = FittedJoints(stiffness={"shoulder": -1.0, "left_finger": 2.0})
+    with pytest.warns(
+        TorchidWarning, match="shoulder, left_finger: an offset without a spring, or a spring that pushes"
+    ):
+        assert not fitted.springs(robot, "identified.xml")

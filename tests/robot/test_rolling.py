@@ -100,3 +100,29 @@ def test_what_no_contact_can_have_is_refused_in_one_line(tmp_path: Path) -> None
         robot = foot_on(tmp_path, shape(f'<sphere radius="{radius}"/>'))
         with pytest.raises(UrdfError, match=f"<sphere radius>: '{radius}'; accepted: 1 decimal number of at least 0"):
             resolve_contacts([ContactConfig("foot", "point")], robot)
+
+
+BALL = '<sphere radius="0.03"/>'
+BESIDE = '<origin xyz="0.07 0 0"/>'
+WHEEL = '<cylinder radius="0.2" length="0.1"/>'
+
+
+@pytest.mark.parametrize(
+    ("shapes", "kind", "radius"),
+    [
+        ([shape(BALL)], "point", 0.03),
+        ([shape(BALL, BESIDE)] * 2, "point", 0.0),
+        ([shape('<sphere radius="0.02"/>'), shape(BALL)], "point", 0.03),
+        ([shape('<box size="1 1 1"/>')], "point", 0.0),
+        ([shape(BALL)], "line", 0.0),
+        ([shape(WHEEL, '<origin rpy="1.5707963 0 0" xyz="0 1 0.01"/>')], "line", 0.2),
+        ([shape(WHEEL, '<origin rpy="1.5 0 0"/>')], "line", 0.0),
+        ([shape(BALL)], "flat", 0.0),
+    ],
+)
+def test_a_shape_about_the_origin_is_taken_and_no_other(
+    tmp_path: Path, shapes: list[str], kind: Any, radius: float
+) -> None:
+    contacts, text = resolve_contacts([ContactConfig("foot", kind)], foot_on(tmp_path, *shapes))
+    assert contacts[0].radius == radius
+    assert ("radius 0:" in text, text == "") == (kind != "flat" and not radius, kind == "flat")

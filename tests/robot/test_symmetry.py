@@ -113,3 +113,15 @@ def arms(folder: Path, *bodies: str) -> Robot:
 def test_names_that_do_not_answer_to_each_other_are_refused(case: tuple, tmp_path: Path) -> None:
     bodies, tokens, found = case
     assert found in refusal(arms(tmp_path, *bodies), *tokens)
+
+
+def test_joints_that_are_not_mirrored_are_refused_with_the_angle(tmp_path: Path) -> None:
+    robot = mirrored_robot(tmp_path, np.random.default_rng(3), upper_axis=np.array([0.5, 0.0, 0.0]))
+    assert "the joints of left_upper and right_upper are " in refusal(robot, "left", "right")
+
+
+def test_a_pair_of_which_one_has_no_mass_is_refused(tmp_path: Path) -> None:
+    origin = '<origin xyz="0 {} 0"/><axis xyz="0 0 1"/>'
+    elements = [link("trunk"), link("l_arm"), link("r_arm", "")]
+    joints = [joint(f"{s}_joint", "trunk", f"{s}_arm", extra=origin.format(y)) for s, y in (("l", 1), ("r", -1))]
+    assert "of l_arm and r_arm one has no mass" in refusal(load(write(tmp_path, *elements, *joints)), "l_", "r_")

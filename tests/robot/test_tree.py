@@ -30,6 +30,7 @@ from synthetic import (
 from urdfs import write
 
 from torchid import parameters
+from torchid.errors import TorchidWarning
 from torchid.robot import load_robot
 
 REAL = (
@@ -134,3 +135,24 @@ def test_mimic_joints_that_follow_mimic_joints_end_at_the_one_that_is_free(tmp_p
     matrix, offset = robot.joint_map
     np.testing.assert_array_equal(matrix, [[1.0], [-2.0], [-6.0]])  # first, middle, last
     np.testing.assert_array_equal(offset, [0.0, 0.25, 3.0 * 0.25 + 0.5])
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@pytest.mark.parametrize("base_link", ["base", "tip"])
+def test_a_joint_that_mimics_a_fixed_one_is_held_at_its_offset(kind: str, base_link: str, tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        *map(link, ["base", "stand", "tip"]),
+        joint("weld", "base", "stand", "fixed"),
+        joint("held", "stand", "tip", kind, mimic("weld", 2.0, 0.7)),
+    )
+    with pytest.warns(TorchidWarning, match="'weld' is fixed, so that it is fixed too"):
+        robot = load_robot(path, base_link)
+    assert (robot.n, robot.body_names) == (0, (base_link,))
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix()
+    slid, turned = transform(np.eye(3), np.array([0.0, 0.0, 0.7])), transform(turn, np.zeros(3))
+    T_base_tip = ORIGIN @ ORIGIN @ (slid if kind == "prismatic" else turned)
+    _, T = robot.link("tip" if base_link == "base" else "base")
+    np.testing.assert_allclose(
+        T, T_base_tip if base_link == "base" else np.linalg.inv(T_base_tip), rtol=0.0, atol=1e-14
+    )

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from refusals import refused
 from urdfs import ARM, BASE, HINGE, INERTIA, INERTIAL, TREE, inertial, joint, link, mimic, refusal, table, write
 
-from torchid.errors import UnknownNameError
+from torchid.errors import TorchidWarning, UnknownNameError, UrdfError
 from torchid.report.urdf_files import identified_urdf
 from torchid.robot import load_robot
 
@@ -263,3 +265,24 @@ def test_a_root_without_mass_below_a_floating_joint_is_the_world(tmp_path: Path,
 )
 def test_any_other_floating_joint_is_refused(tmp_path: Path, elements: tuple[str, ...]) -> None:
     assert "joint 'root': type 'floating'" in refusal(write(tmp_path, *elements))
+
+
+def test_a_stated_mass_is_spread_over_a_robot_without_any(tmp_path: Path) -> None:
+    hip, knee, sole = (f'<origin xyz="{place}"/><axis xyz="0 0 1"/>' for place in ("0 0 0.4", "0.2 0 0.4", "0 0 9"))
+    path = write(
+        tmp_path,
+        *(link(name, "") for name in ("base", "arm", "hand", "tool")),
+        joint("hip", "base", "arm", extra=hip),
+        joint("knee", "arm", "hand", extra=knee),
+        joint("weld", "hand", "tool", "fixed", sole),
+    )
+    with pytest.warns(TorchidWarning, match="no link has mass; 6 kg are spread evenly over 3 links"):
+        robot = load_robot(path, total_mass=6.0)
+    np.testing.assert_allclose(robot.nominal[:, 0], 2.0, rtol=1e-15)
+    np.testing.assert_allclose(robot.nominal[:, 1:4] / 2.0, [[0, 0, 0.2], [0.1, 0, 0.2], [0, 0, 4.5]], atol=1e-15)
+    radius = (2.0 / 1000.0 / (4.0 / 3.0 * np.pi)) ** (1.0 / 3.0)
+    assert robot.nominal[0, 9] == pytest.approx(0.4 * 2.0 * radius**2)
+    refused(lambda: load_robot(path, total_mass=-1.0), f"{path}: total_mass: ", UrdfError)
+    assert load_robot(write(tmp_path, *TREE), total_mass=50.0).nominal[:, 0].sum() < 3.0, (
+        "a file with masses keeps them"
+    )

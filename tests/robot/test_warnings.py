@@ -96,3 +96,11 @@ def test_a_real_robot_is_read_whole_or_refused_for_its_true_fault(path: Path) ->
     assert sorted(independent) == sorted(robot.joint_names)
     assert sorted(robot.links) == sorted(link for body in robot.bodies for link in body.links)
     assert np.isfinite(robot.nominal).all()
+
+
+def test_inertias_of_no_body_are_said_in_one_line(tmp_path: Path) -> None:
+    parts = [link("arm", inertial(ixx="0.3")), HINGE, link("tip", inertial(mass="0")), joint("wrist", "arm", "tip")]
+    _, caught = warned(write(tmp_path, BASE, *parts))
+    (message,) = [str(w.message) for w in caught]
+    assert "link 'arm': largest principal inertia 0.3 exceeds" in message
+    assert message.endswith("and the inertia of tip is no body's either; used as written")

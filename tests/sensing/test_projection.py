@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from synthetic import ANYMAL, Array, load, random_states
+from synthetic import ANYMAL, SOLO12, Array, load, random_states
 from torch import Tensor
 
 from torchid.regressor import FrameJacobian
@@ -217,3 +217,20 @@ def test_flags_that_are_numbers_are_refused_and_never_taken_for_indices() -> Non
         Projection([True] * 2, [False] * 3)(
             torch.ones(4, 3, 8), numbers, torch.ones(4, 8, 2), torch.ones(4, 2), torch.ones(4, 3)
         )
+
+
+SOLOS_FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]
+
+
+def test_each_straight_knee_hides_one_direction_of_the_base_from_the_torques() -> None:
+    """A force in the plane of hip and straight knee, along the leg, does no work on the leg's joints."""
+    scene = Scene(robot_of(SOLO12), SOLOS_FEET, 7, samples=16)
+    scene.touching[:] = True
+    rng = np.random.default_rng(7)
+    straight = torch.from_numpy(rng.random((16, 4)) < 0.5)
+    scene.q[:, [9, 12, 15, 18]] *= ~straight  # the knees
+    found = {}
+    for group in check(scene, np.ones(12, bool), np.zeros(12, bool)):
+        found |= dict(zip(group.index.tolist(), group.base_rank.tolist(), strict=True))
+    assert [found[sample] for sample in range(16)] == (6 - straight.sum(1)).tolist()
+    assert len(set(found.values())) > 3

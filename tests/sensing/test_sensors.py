@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from synthetic import ANYMAL, UR5, Oracle, load, make_log
 from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError, about_file
 from torchid.identifiability.base_parameters import (
     StateReport,
+    merge_state_reports,
     require_base,
     state_reports,
 )
@@ -179,3 +181,17 @@ def test_the_axes_of_line_contacts_are_named_where_the_base_is_lost() -> None:
     with pytest.raises(BaseLostError) as raised:
         require_base(lost, contacts=contacts[2:])
     assert "line_axis" not in str(raised.value)
+
+
+def test_a_sample_of_a_long_log_counts_as_one_of_a_short_log() -> None:
+    short = [StateReport("stand", 1, 6, 2, value, 0.0, {2: 1.0}) for value in (0.0, 0.1, 0.4)]
+    long = StateReport("stand", 9, 8, 6, 0.3, 1.0, {6: 1.0})
+    for logs in ([*short, long], [long, *short[::-1]]):
+        (report,) = merge_state_reports([[log] for log in logs])
+        assert (report.samples, report.rows, report.base_rank, report.base_singular_value) == (12, 8, 6, 0.3)
+        assert report.base_rank_shares == {6: pytest.approx(0.75), 2: pytest.approx(0.25)}
+        assert report.base_full_share == pytest.approx(0.75)
+    (report,) = merge_state_reports([[log] for log in short])
+    assert (report.base_rank, report.base_singular_value, report.base_full_share) == (2, 0.1, 0.0)
+    (report,) = merge_state_reports([[replace(long, samples=3)], *([log] for log in short)])
+    assert report.base_rank == 6, "which half of the samples reach"

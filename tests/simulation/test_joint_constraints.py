@@ -134,3 +134,13 @@ def test_a_simulated_robot_can_have_held_joints_loops_and_joints_without_motors(
     assert plant.constraints[0].shape == (3, plant.nv)
     with pytest.raises(UnknownNameError, match=r"robot\.weld"):
         Plant(urdf, (), 1000.0, stated=ConstrainedRobot(weld={"fourth": 0.0}))
+
+
+def test_the_log_of_a_robot_with_a_held_joint_is_that_of_the_robot_with_a_weld(tmp_path: Path) -> None:
+    held = {"torso_pitch": 0.1}
+    config = only(short(tmp_path / "out", "robot.weld={torso_pitch: 0.1}", "friction.enabled=false"), "squat_1.0hz")
+    motion = replace(config.motions[0], waves=[WaveConfig("com_z", 1.0, 0.03)])
+    log = set_up_simulation(config).run(motion)[0].log
+    assert "torso_pitch" not in log.joint_names
+    measured, predicted = forces(log, BIPED, SOLES, held)
+    assert np.abs(predicted - measured).max() < 1e-5 * np.abs(measured).max()

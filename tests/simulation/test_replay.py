@@ -145,3 +145,31 @@ def test_what_cannot_be_replayed_is_named(tmp_path: Path) -> None:
     assert "armature of first" in refused(
         lambda: replay_log(negative, log, (), log.windows(0.2), TIMES), str(tmp_path), InputError
     )
+
+
+def test_springs_of_joints_pull_towards_position_zero(tmp_path: Path) -> None:
+    true = arm(tmp_path)
+    log = swinging(true)
+    held = replace(log, torque=log.torque + log.position * [3.0, 1.5])
+    assert drift(model_of(true, stiffness=3.0), held) < 2e-5
+    assert drift(model_of(true), held) > 1e-2
+    assert drift(model_of(true, stiffness=-3.0), replace(log, torque=log.torque - log.position * [3.0, 1.5])) < 2e-5
+
+
+def test_an_arm_on_a_turned_base_feels_gravity_as_the_log_says(tmp_path: Path) -> None:
+    true, tilt = arm(tmp_path), Rotation.from_euler("xyz", [0.4, -0.8, 0.3])
+    log = swinging(true, tilt=tilt)
+    assert drift(model_of(true), log) < 2e-5
+    assert drift(model_of(true), replace(log, quat_xyzw=None)) > 1e-2
+
+
+def test_friction_that_drops_with_speed_is_that_of_the_log(tmp_path: Path) -> None:
+    """For a joint that swings, but for what MuJoCo's soft constraint creeps where it turns."""
+    true = arm(tmp_path)
+    log = swinging(true)
+    at_rest, velocity = np.array([0.5, 0.2]), 2.0
+    dry = np.sign(log.velocity) * at_rest * np.exp(-np.square(log.velocity / velocity))
+    log = replace(log, torque=log.torque + dry)
+    with_it, without = replace(model_of(true), stribeck=at_rest, stribeck_velocity=velocity), model_of(true)
+    assert drift(with_it, log) < 2.5e-3
+    assert drift(without, log) > 3e-2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from motions import value
 from scipy.spatial.transform import Rotation
-from simulated import LIFTING
+from simulated import LIFTING, SOLES
 from synthetic import Array
 
 from torchid.config import SensorImperfectionsConfig
@@ -187,3 +187,15 @@ def test_a_foot_that_reads_along_the_normal_reads_nothing_else() -> None:
     log = sensor_log(alone, NONE, seed=3)
     assert log.contact_wrench_local is None
     np.testing.assert_array_equal(value(log.contact_force_normal), value(alone.contact_force_normal))
+
+
+def test_contact_flags_are_read_off_the_measured_force_whatever_the_exact_log_says(biped_folder: Path) -> None:
+    exact = read_log(biped_folder / "exact" / f"{LIFTING}.npz")
+    sensors = SensorImperfectionsConfig(noise=dataclasses.replace(NOISE, enabled=True))
+    flags = value(sensor_log(exact, sensors, seed=0).contact_active)
+    lying = dataclasses.replace(exact, contact_active=~value(exact.contact_active))
+    np.testing.assert_array_equal(value(sensor_log(lying, sensors, seed=0).contact_active), flags)
+    assert (flags != value(exact.contact_active)).mean() < 0.02
+    assert flags.any(axis=0).all()
+    assert (~flags).any(axis=0).all()
+    assert exact.contact_names == SOLES

@@ -17,6 +17,7 @@ from simulated import (
     LIFTING,
     SOLES,
     SQUATS,
+    STOOD,
     SWAYS,
     UNSEEN,
     feet_of,
@@ -28,7 +29,7 @@ from simulated import (
 )
 from synthetic import ANYMAL, G1, SOLO12
 
-from torchid.config import FootConfig, SensorImperfectionsConfig, SimulationConfig
+from torchid.config import BoundsConfig, FootConfig, SensorImperfectionsConfig, SimulationConfig
 from torchid.errors import InputError, UrdfError
 from torchid.logs import read_log
 from torchid.simulation import set_up_simulation
@@ -136,3 +137,23 @@ def test_a_threshold_that_no_foot_ever_reaches_is_refused() -> None:
     config = dataclasses.replace(solo12(), sensors=SensorImperfectionsConfig(contact_threshold=30.0))
     with pytest.raises(InputError, match=r"sensors.contact_threshold: 30 N, but .* never bears more than"):
         set_up_simulation(config).run(config.motions[0])
+
+
+@pytest.mark.parametrize(
+    ("found", "bounds", "message"),
+    [
+        ({"height_change": 0.3}, {}, "base height changes by 0.3 m"),
+        ({"slip": 0.02}, {}, "a foot slips by 20 mm"),
+        ({"zmp_margin": 0.001}, {}, "zero-moment point 1 mm inside the support"),
+        ({"height_change": np.nan}, {}, "base height changes by nan"),
+        ({"slip": 0.0005}, {"slip_m": 0.0001}, "a foot slips by 0.5 mm"),
+        ({"beyond_limits": 0.01}, {}, "a joint passes its limits by 0.01"),
+        ({"effort": 1.2}, {}, "a joint needs 120 % of its effort limit"),
+    ],
+)
+def test_a_bound_that_is_broken_is_named_with_its_motion(
+    found: dict[str, Any], bounds: dict[str, float], message: str
+) -> None:
+    STOOD.require_within(BoundsConfig(), "m")
+    with pytest.raises(InputError, match=f"^motions.m: {message}"):
+        dataclasses.replace(STOOD, **found).require_within(BoundsConfig(**bounds), "m")

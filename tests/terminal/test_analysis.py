@@ -173,3 +173,15 @@ def test_all_tables_are_printed_when_asked_for(
         assert title in str(printed["--verbose"])
         assert title not in str(printed[None])
     assert str(printed[None]).splitlines() == analysis_lines(lame, terminal_width())
+
+
+def test_ranks_of_the_base_are_said_to_be_those_of_joints_that_move(lame: Analysis) -> None:
+    (_, attention) = (line for line in analysis_lines(replace(lame, resting=0.31), 1000) if "attention" in line)
+    assert "31 % of the logs' torques count as unmeasured at rest (actuators.stiction); the base is" in attention
+
+
+def test_where_nothing_touches_no_sensor_is_needed(file: Path, tmp_path: Path) -> None:
+    only_air = ["analysis.scenarios={}", "analysis.scenarios={air: [[]]}"]
+    settings = [*only_air, "sensors={}", f"output={tmp_path / 'run'}"]
+    flight = analyze(load_analysis(file, settings))
+    assert text(flight).startswith("No sensor is needed: the base is observable in the contact state")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -87,3 +88,22 @@ def test_all_errors_are_printed_when_asked_for(run: Path, capsys: pytest.Capture
     assert "of its variation" in printed["--verbose"]
     assert "of its variation" not in str(printed[None])
     assert str(printed[None]).splitlines()[-1] == f"written to    {run / 'evaluation' / 'sway_test'}"
+
+
+def test_a_run_whose_model_does_not_explain_its_own_logs_says_so_of_others(run: Path, evaluated: EvaluatedRun) -> None:
+    assert evaluated.explained
+    assert "noise alone" not in evaluation_lines(evaluated, 400)[0]
+    file = run / "metrics.json"
+    document = json.loads(file.read_text())
+    try:
+        file.write_text(json.dumps(document | {"misfit": document["misfit"] | {"explained": False}}))
+        lacking = torchid.evaluate(run, LOG)
+    finally:
+        file.write_text(json.dumps(document))
+    assert evaluation_lines(lacking, 400)[0].endswith("'s; residuals of the run's own logs are not noise alone")
+
+
+def test_samples_left_out_are_counted(evaluated: EvaluatedRun) -> None:
+    lines = evaluation_lines(replace(evaluated, excluded={"sway_test": 12}), 80)
+    assert "left out      12 samples that torchid check rejects" in lines
+    assert not any("left out" in line for line in evaluation_lines(evaluated, 80))

@@ -203,3 +203,18 @@ def test_what_came_after_the_last_checkpoint_is_done_again(
         assert capsys.readouterr().err == expected
     assert main(command(experiment, output, seldom, "--resume")) == 0
     assert_as_uninterrupted(output, run)
+
+
+def test_an_interrupt_while_results_are_written_loses_nothing_of_the_training(
+    experiment: Path, run: Path, output: Path
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("torchid.commands.results.write_json", stopped)
+        assert main(command(experiment, output, "--resume")) == 1
+    assert names_in(output.parent) == ["run.training"]
+    assert load_checkpoint(training_of(output))["trainer"]["epoch"] == EPOCHS
+    assert main(command(experiment, output, "--resume")) == 0
+    assert_as_uninterrupted(output, run)

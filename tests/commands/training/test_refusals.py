@@ -22,9 +22,11 @@ from trainings import (
     training_of,
 )
 
+import torchid
 from torchid.cli import main
 from torchid.commands.folder import CHECKPOINT
 from torchid.commands.training import load_checkpoint, save_checkpoint
+from torchid.config import load_config
 
 pytestmark = pytest.mark.usefixtures("events")
 
@@ -181,3 +183,49 @@ def test_a_slip_in_the_settings_of_a_descent_is_named_before_anything_is_written
 ) -> None:
     line = refusal(command(experiment, tmp_path / "run", override), tmp_path, capsys)
     assert f"experiment.yaml: {expected}" in line
+
+
+def test_a_finished_run_is_not_gone_on_with(experiment: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = resume_refused(experiment, run, capsys)
+    assert f"{run}: --resume: a finished run; accepted: an unfinished one, or overwrite=true" in line
+
+
+def test_an_epoch_that_cannot_be_is_not_gone_on_from(
+    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = training_of(output)
+    state = load_checkpoint(folder)
+    state["trainer"]["epoch"] = -5
+    save_checkpoint(folder, state)
+    line = resume_refused(experiment, output, capsys)
+    assert f"{folder / CHECKPOINT}: file: " in line
+    assert f"epoch: found -5; accepted: a whole number from 0 to {EPOCHS}" in line
+
+
+def test_nothing_to_learn_is_noticed_before_anything_is_written(
+    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bodies = ", ".join(torchid.load_robot(DEMO / "quadruped.urdf").body_names)
+    line = refusal(command(experiment, tmp_path / "run", f"estimator.frozen=[{bodies}]"), tmp_path, capsys)
+    assert "experiment.yaml: sensors: no parameter is in reach of them" in line
+
+
+def test_overrides_may_come_before_and_after_options_and_strangers_are_refused(
+    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As they stand in `torchid identify FILE --resume overwrite=true`, where argparse takes them for strangers."""
+    place, once = f"output={tmp_path / 'run'}", "estimator.training.epochs=1"
+    assert main(["identify", str(experiment / "experiment.yaml"), once, "--resume", place, "--debug"]) == 0
+    assert load_config(tmp_path / "run" / "config.yaml").estimator.training.epochs == 1
+    for stranger in (["identify", "a.yaml", "--resume", "--hurry"], ["evaluate", "run", "--log", "a.npz", "b=1"]):
+        with pytest.raises(SystemExit) as raised:
+            main(stranger)
+        assert raised.value.code == 2
+        assert f"unrecognized arguments: {stranger[-1]}" in capsys.readouterr().err
+
+
+def test_an_option_that_is_a_setting_of_the_file_is_written_as_one(capsys: pytest.CaptureFixture[str]) -> None:
+    for option, setting in (("--output=runs/a", "output"), ("--robot.base-link=trunk", "robot.base_link")):
+        with pytest.raises(SystemExit):
+            main(["identify", "a.yaml", option])
+        assert capsys.readouterr().err.rstrip().endswith(f"; accepted: settings of the file as {setting}=VALUE")
