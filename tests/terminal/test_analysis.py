@@ -95,7 +95,7 @@ def test_any_number_of_scenarios_and_sensor_sets_fits_on_a_screen(
     assert lines[-1] == f"written to    {lame.output}"
     assert max(len(line) for line in lines[:-1] if "-limb-" not in line) <= width
     shown = sum(line.startswith(("proposed ", "set ")) for line in lines)
-    counted = [int(line.split()[1]) for line in lines if line.endswith("analysis.json, --verbose") and "sets" in line]
+    counted = [int(line.split()[1]) for line in lines if line.endswith("analysis.json, --verbose") and " set" in line]
     assert shown + sum(counted) == sets
 
 

@@ -326,9 +326,8 @@ def new_folder(output: Path, overwrite: bool = False, kind: FolderKind = RUN) ->
         ConfigError: `output` exists and may not be replaced, from the start or when the block has ended.
     """
     check_free(output, overwrite, kind)
-    with ExitStack() as stack:
+    with _parent_folders(output), ExitStack() as stack:
         with _creation_errors_explained(output):
-            output.parent.mkdir(parents=True, exist_ok=True)
             folder = stack.enter_context(staging_folder(output))
             (folder / NEW).mkdir()
         yield folder / NEW
@@ -342,6 +341,20 @@ def new_folder(output: Path, overwrite: bool = False, kind: FolderKind = RUN) ->
             _put(folder, output, overwrite, kind)
             if kind != TRAINING:
                 note_written(output)
+
+
+@contextmanager
+def _parent_folders(output: Path) -> Iterator[None]:
+    """The folders above `output`, which go with the block if they came with it and it leaves nothing in them."""
+    made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
+    try:
+        with interrupts_deferred(), _creation_errors_explained(output):
+            output.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        with interrupts_deferred(), suppress(OSError):  # a run is in it, this one or another
+            for folder in made:
+                folder.rmdir()
 
 
 @contextmanager
@@ -397,16 +410,16 @@ def claim_folder(folder: Path) -> Iterator[None]:
         ConfigError: another process is at work there.
     """
     path = folder.with_name(f".{folder.name}.lock")
-    with interrupts_deferred(), _creation_errors_explained(folder):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with _parent_folders(folder):
+        with interrupts_deferred(), _creation_errors_explained(folder):
+            try:
+                handle = lock(path, os.O_RDWR | os.O_CREAT)
+            except (BlockingIOError, FileNotFoundError) as error:
+                accepted = "another output, or patience"
+                raise ConfigError(folder, "output", "another run is at work there", accepted) from error
         try:
-            handle = lock(path, os.O_RDWR | os.O_CREAT)
-        except (BlockingIOError, FileNotFoundError) as error:
-            accepted = "another output, or patience"
-            raise ConfigError(folder, "output", "another run is at work there", accepted) from error
-    try:
-        yield
-    finally:
-        with interrupts_deferred():
-            path.unlink(missing_ok=True)
-            os.close(handle)
+            yield
+        finally:
+            with interrupts_deferred():
+                path.unlink(missing_ok=True)
+                os.close(handle)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -48,6 +49,7 @@ TOUCH_WEIGHT = 0.05
 
 _TURN = 7.0  # [rad]: beyond this, angles are in degrees
 _STEPS_S = (2e-4, 0.2)  # between samples of recordings
+_MAX_LOG_UNIT_RATIO = 0.15  # of velocities with slopes of positions in the same unit
 _MIN_CORRELATION = 0.9  # of velocities with slopes of positions
 
 
@@ -583,7 +585,7 @@ class _Proposer:
         return values if np.isfinite(values).any() else None
 
     def _settle_units(self) -> None:
-        """Degrees, where positions are far beyond a turn."""
+        """Degrees, where positions are far beyond a turn, and velocities 57 times their slopes."""
         family, position = self.family_of.get("joint_position"), self._values("joint_position")
         if family is None or position is None:
             return
@@ -594,6 +596,24 @@ class _Proposer:
             of_hinges = {name: "deg" for name, is_hinge in zip(family.names, hinges, strict=False) if is_hinge}
             entry["unit"] = "deg" if hinges.all() else of_hinges
             self.out.assumed["joint_position"] = f"deg, from values up to {np.nanmax(np.abs(position)):.3g}"
+        if not self.files and entry.get("unit") in (None, "deg"):
+            self._settle_velocities(np.radians(position) if "unit" in entry else position)
+
+    def _settle_velocities(self, position: NDArray[np.float64]) -> None:
+        """Degrees per second, by the slopes of positions (N, n) [rad]."""
+        family = self.family_of.get("joint_velocity")
+        velocity = self._values("joint_velocity")
+        stamps = self._values("time")
+        if family is None or velocity is None or stamps is None or any(family.units):
+            return
+        if velocity.shape != position.shape or len(stamps) != len(position):
+            return
+        correlation, step = slope_fit(position, velocity)
+        unit_s = UNITS["time"].get(self.out.columns.get("time", {}).get("unit", "s"), 1.0)
+        ratio = unit_s * float(np.nanmedian(np.diff(stamps[:, 0]))) / max(step, np.finfo(float).tiny)
+        if correlation > _MIN_CORRELATION and abs(math.log(ratio * UNITS["angle"]["deg"])) < _MAX_LOG_UNIT_RATIO:
+            self.out.columns["joint_velocity"]["unit"] = "deg/s"
+            self.out.assumed["joint_velocity"] = f"deg/s, as they are {ratio:.3g} times the slopes of positions"
 
     # ---------------------------------------------------------------------------------------- what a person has to say
 
