@@ -123,7 +123,7 @@ def test_tensorboard_shows_train_and_test_before_and_after(run: Path) -> None:
         (urdf,), (identified,) = map(events.Scalars, tags)
         assert urdf.step == identified.step == 1  # points, which no smoothing changes
         assert identified.value < urdf.value
-    names = enumerate(OF_A_RUN, 1)
+    names = enumerate((*OF_A_RUN, "ridge"), 1)
     assert set(events.Tags()["images"]) == {f"figure_{k}_{name}" for k, name in names}
     assert min(events.Tags()["scalars"]).startswith("error_relative_"), "which TensorBoard shows first"
     text = events.Tensors("answer/text_summary")[0].tensor_proto.string_val[0].decode()
