@@ -32,6 +32,7 @@ from torchid.commands.folder import (
     refuse_link,
 )
 from torchid.config import ExperimentConfig, dump_config, inputs_of
+from torchid.config.yaml_text import check_yaml
 from torchid.errors import ConfigError, InputError, SensorError, excerpt, warn
 from torchid.estimators import Conditions, Epoch, Estimate, Sgd, SgdEstimate, Trainer
 from torchid.estimators.least_squares import IDENTIFIED
@@ -240,6 +241,7 @@ class Training:
     def _check(self, state: Mapping[str, Any], trainer: Trainer, path: Path) -> None:
         if set(state) != {"config", "logs", "trainer"}:
             raise InputError(path, "file", "not a checkpoint of a run", "one that torchid identify wrote")
+        check_yaml(state["config"])
         before, now = (yaml.safe_load(text) for text in (state["config"], self._text))
         for key, old, new in _differences(before, now):
             if key not in _FREE_TO_CHANGE:

@@ -230,9 +230,13 @@ class LearnableParameters(nn.Module, ABC):
             data = torch.cat([data, torch.from_numpy(np.hstack([problem.terms.C, problem.terms.D])) @ slopes])
         prior = slopes[: len(self.free)] / self.scale.cpu()[:, None]
         hessian = 2.0 * (data.T @ data / max(problem.rows, 1) + ridge * prior.T @ prior)
-        values, vectors = torch.linalg.eigh(hessian)  # negative eigenvalues are rounding
-        root = (values.clamp_min(0.0) + damping).rsqrt()
-        self.preconditioner.copy_(vectors @ (root[:, None] * vectors.T))
+        self.preconditioner.copy_(_inverse_root(hessian, damping))
+
+
+def _inverse_root(hessian: Tensor, damping: float) -> Tensor:
+    """(H + damping I)^(-1/2) of a symmetric matrix, (n, n), whose negative eigenvalues are rounding."""
+    values, vectors = torch.linalg.eigh(hessian)
+    return vectors @ ((values.clamp_min(0.0) + damping).rsqrt()[:, None] * vectors.T)
 
 
 class FreeParameters(LearnableParameters):
@@ -483,8 +487,7 @@ def least_penalized(settings: Sgd, problem: LinearProblem, start: Minimizer) -> 
     """
     penalized, y = _Penalized(settings, problem), deviations(problem, start)
     damping = 1e-6 * float(penalized.hessian.diagonal().max()) + settings.penalties.curvature
-    values, vectors = torch.linalg.eigh(penalized.hessian)
-    P = (vectors @ ((values.clamp_min(0.0) + damping).rsqrt()[:, None] * vectors.T)).numpy()
+    P = _inverse_root(penalized.hessian, damping).numpy()
 
     def loss(u: Array) -> tuple[float, Array]:
         value, gradient = penalized.slope(y + P @ u)

@@ -6,22 +6,35 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, about_file, excerpt, warn_about_file
+from torchid.errors import LogError, about_file, excerpt, join_names, warn_about_file
 from torchid.logs.arrays import parse_names
-from torchid.logs.columns import KEY, KINDS, Columns, names_field
+from torchid.logs.columns import (
+    KEY,
+    KINDS,
+    MOST_LISTED,
+    Columns,
+    as_in_file,
+    fits,
+    letters_of,
+    list_parts,
+    names_field,
+)
 from torchid.logs.containers import LogKind, existing_log_kind, open_container
 from torchid.logs.gaps import refuse_gaps
 from torchid.logs.log import (
+    CONTACT_READINGS,
+    IMU_FIELDS,
     NAME_FIELDS,
     NAN_ALLOWED,
     NORMALS,
+    WRENCHES,
     FloatArray,
     check_finite,
     check_shape,
@@ -32,7 +45,7 @@ from torchid.logs.log import (
     to_float64,
 )
 from torchid.logs.quaternion import make_sign_continuous
-from torchid.logs.schema import columns_by_file
+from torchid.logs.schema import column_pattern, columns_of_file
 from torchid.logs.tables import table_names
 from torchid.logs.time_range import LogFile
 from torchid.logs.timeline import JITTER, LONGEST_STEP, spline_derivatives
@@ -237,6 +250,65 @@ def _side_by_side(
             )
             raise LogError.at_field(of, f"'{missing[0]}' missing", accepted)
     return np.asarray(values[:, [own.index(name) for name in names]])
+
+
+def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Sequence[str]) -> list[Columns]:
+    """The map without the entries that are for others of several files, for each.
+
+    Entries without columns are for the file with the field that they belong to. Of columns that several files have, a
+    name says before `::` of which file they are: `torques.csv::{joint}`. An entry may have joints, contacts or sensors
+    in each of several files.
+
+    Args:
+        columns: the map.
+        given: columns or arrays of each file.
+        files: their names.
+
+    Raises:
+        LogError: an entry of which no file has a column.
+    """
+    maps = [columns_of_file(as_in_file(columns, file, files), texts) for file, texts in zip(files, given, strict=True)]
+    found = [_entries_in(of_file, texts) for of_file, texts in zip(maps, given, strict=True)]
+    for name in columns.fields:
+        if not any(name in of_file for of_file in found):
+            none = f"no column of it in {join_names(files, MOST_LISTED)}"
+            raise LogError.at_field(f"{KEY}.{name}", none, "columns that one of the files has")
+    out = []
+    for of_file, has in zip(maps, found, strict=True):
+        without: dict[str, Any] = dict.fromkeys({*columns.fields, "imu_frame"} - has)
+        without |= {} if WRENCHES[1] in has else {"plates": {}}
+        out.append(replace(of_file, **without))
+    return out
+
+
+def _entries_in(columns: Columns, given: Sequence[str]) -> set[str]:
+    """Entries of a map of which a file has a column, and those without columns that belong to one of its fields.
+
+    Stamps by their step belong to every file without a column of stamps.
+    """
+    parts = list_parts(columns).values()
+    patterns = [
+        (part.key.partition(".")[0], letters_of(text), column_pattern(part, text))
+        for part in parts
+        for text in part.patterns
+    ]
+    out = set[str]()
+    for text in given:
+        of_fields = [(field, letters) for field, letters, regex in patterns if regex.fullmatch(text)]
+        ignored = [letters_of(pattern) for pattern in columns.ignore if fits(text, pattern)]
+        most = max((*ignored, *(letters for _, letters in of_fields)), default=0)
+        out |= {field for field, letters in of_fields if letters == most}
+    has = {*out, *(text.partition(".")[0] for text in given)}
+    if columns.time is not None and columns.time.step is not None and "time" not in has:
+        out.add("time")
+    by_force = columns.contact_active is not None and columns.contact_active.above is not None
+    beside: dict[str, Sequence[str]] = {
+        "contact_active": CONTACT_READINGS if by_force else ("joint_position",),  # of any file, contacts that touch
+        "joint_torque": ("joint_velocity",),
+        "imu_frame": IMU_FIELDS,
+    }
+    with_columns = {field for field, *_ in patterns}
+    return out | {name for name, fields in beside.items() if name not in with_columns and has & set(fields)}
 
 
 def _maps(paths: Sequence[Path], columns: Columns | None) -> list[Columns | None]:

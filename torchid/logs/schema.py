@@ -30,7 +30,6 @@ from torchid.logs.columns import (
     EntryPart,
     Gains,
     TimeEntry,
-    as_in_file,
     check_columns,
     fits,
     letters_of,
@@ -41,11 +40,9 @@ from torchid.logs.columns import (
     values_of_all,
 )
 from torchid.logs.log import (
-    CONTACT_READINGS,
     FLAG_ACCEPTED,
     FLAG_WORDS,
     FORCE_NORMAL,
-    IMU_FIELDS,
     NAME_FIELDS,
     POINTS,
     SHAPES,
@@ -195,7 +192,7 @@ class _Search:
     def _assign(self) -> dict[str, list[str]]:
         """The names in columns, by entry of those whose names columns alone have: that with most letters has it."""
         stated = {column for matched in self._stated.values() for column in matched.columns} | self.left_out
-        regexes = {key: _regex(part, part.entry.column or "") for key, part in self._free.items()}
+        regexes = {key: column_pattern(part, part.entry.column or "") for key, part in self._free.items()}
         out = defaultdict[str, list[str]](list)
         for text in self._given:
             names = {key: match["name"] for key, regex in regexes.items() if (match := regex.fullmatch(text))}
@@ -242,7 +239,7 @@ def _fill(text: str, values: Mapping[str, str], number: int) -> str:
     return PLACEHOLDER.sub(lambda x: f"{number:{x[2] or ''}d}" if x[1] == "index" else values[x[1]], text)
 
 
-def _regex(part: EntryPart, text: str) -> re.Pattern[str]:
+def column_pattern(part: EntryPart, text: str) -> re.Pattern[str]:
     """Columns that fit a pattern of an entry; the group `name` has the name."""
     axes = "|".join(part.components)
     groups = {part.kind: "(?P<name>.+)", "index": r"\d+", "component": r"\d"}
@@ -252,7 +249,7 @@ def _regex(part: EntryPart, text: str) -> re.Pattern[str]:
     return re.compile("".join(x for pair in zip(literals, [*holders, ""], strict=True) for x in pair))
 
 
-_NATIVE = {field: _regex(native_part(field), native_part(field).entry.column or "") for field in COLUMN_FIELDS}
+_NATIVE = {field: column_pattern(native_part(field), native_part(field).entry.column or "") for field in COLUMN_FIELDS}
 
 
 def native_field(column: str) -> str:
@@ -762,69 +759,9 @@ def _common_names(
     return {**{field: of_file for field, of_file in named.items()}, **names}
 
 
-# ----------------------------------------------------------------------------------------------- several files, one map
-
-
 def columns_of_file(columns: Columns, given: Sequence[str]) -> Columns:
     """The map for a file with some columns or arrays: with one of `other_times` if that of `time` is not there."""
     others = [entry for entry in columns.other_times if entry.column in given]
     if not others or (columns.time is not None and columns.time.column in given):
         return columns
     return replace(columns, time=TimeEntry(**vars(others[0])))
-
-
-def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Sequence[str]) -> list[Columns]:
-    """The map without the entries that are for others of several files, for each.
-
-    Entries without columns are for the file with the field that they belong to. Of columns that several files have, a
-    name says before `::` of which file they are: `torques.csv::{joint}`. An entry may have joints, contacts or sensors
-    in each of several files.
-
-    Args:
-        columns: the map.
-        given: columns or arrays of each file.
-        files: their names.
-
-    Raises:
-        LogError: an entry of which no file has a column.
-    """
-    maps = [columns_of_file(as_in_file(columns, file, files), texts) for file, texts in zip(files, given, strict=True)]
-    found = [_entries_in(of_file, texts) for of_file, texts in zip(maps, given, strict=True)]
-    for name in columns.fields:
-        if not any(name in of_file for of_file in found):
-            none = f"no column of it in {join_names(files, MOST_LISTED)}"
-            raise LogError.at_field(f"{KEY}.{name}", none, "columns that one of the files has")
-    out = []
-    for of_file, has in zip(maps, found, strict=True):
-        without: dict[str, Any] = dict.fromkeys({*columns.fields, "imu_frame"} - has)
-        without |= {} if WRENCHES[1] in has else {"plates": {}}
-        out.append(replace(of_file, **without))
-    return out
-
-
-def _entries_in(columns: Columns, given: Sequence[str]) -> set[str]:
-    """Entries of a map of which a file has a column, and those without columns that belong to one of its fields.
-
-    Stamps by their step belong to every file without a column of stamps.
-    """
-    parts = list_parts(columns).values()
-    patterns = [
-        (part.key.partition(".")[0], letters_of(text), _regex(part, text)) for part in parts for text in part.patterns
-    ]
-    out = set[str]()
-    for text in given:
-        of_fields = [(field, letters) for field, letters, regex in patterns if regex.fullmatch(text)]
-        ignored = [letters_of(pattern) for pattern in columns.ignore if fits(text, pattern)]
-        most = max((*ignored, *(letters for _, letters in of_fields)), default=0)
-        out |= {field for field, letters in of_fields if letters == most}
-    has = {*out, *(text.partition(".")[0] for text in given)}
-    if columns.time is not None and columns.time.step is not None and "time" not in has:
-        out.add("time")
-    by_force = columns.contact_active is not None and columns.contact_active.above is not None
-    beside: dict[str, Sequence[str]] = {
-        "contact_active": CONTACT_READINGS if by_force else ("joint_position",),  # of any file, contacts that touch
-        "joint_torque": ("joint_velocity",),
-        "imu_frame": IMU_FIELDS,
-    }
-    with_columns = {field for field, *_ in patterns}
-    return out | {name for name, fields in beside.items() if name not in with_columns and has & set(fields)}
