@@ -169,6 +169,10 @@ REFUSED = {
         ),
         "robot.xml: MJCF: its reader crashed (SIGSEGV)",
     ),
+    "four thousand bodies": (
+        BODY.format("", HINGE.format(""), "").replace("</worldbody>", "<body/>" * 4000 + "</worldbody>"),
+        "robot.xml: <body>: 4002 of them; accepted: at most 3000 in a scene",
+    ),
     "damped base": (
         BODY.format("", '<joint type="free" damping="1"/>', ""),
         f"<joint>, line 3: damping 1{' 0 0' * (not IS_MUJOCO_3)} of a free",

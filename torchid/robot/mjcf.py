@@ -32,6 +32,7 @@ mujoco.set_mju_user_warning(lambda _: None)  # MuJoCo would write a log file whe
 
 _MOST_FILES = 100
 _LONGEST_TAG = 20  # lines
+_MAX_SCENE_BODIES = 10 * MAX_LINKS
 _MULTIPLYING = ("replicate", "attach", "composite", "flexcomp")
 
 
@@ -177,12 +178,12 @@ class MjcfModel:
     def __init__(self, path: Path) -> None:
         """Read and compile a file. Raises UrdfError: MuJoCo does not take it, or it has no joint."""
         self.path, self.text = path, MjcfText(path)
-        if next(self.text.root.iter(*_MULTIPLYING, "model", "hfield"), None) is not None:
-            _try_to_read(path, path.stat().st_mtime_ns)
+        _try_to_read(path, path.stat().st_mtime_ns)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # of MuJoCo, about elements that it will not have for ever
                 self.spec = mujoco.MjSpec.from_file(str(path))
+                self._check_size()
                 meshes, dropped = self._drop_files()
                 self.model = self.spec.compile()
         except ValueError as error:
@@ -254,6 +255,12 @@ class MjcfModel:
         return f"<{tag}>{f' {name!r}' if name else ''}{where}"
 
     # ------------------------------------------------------------------------------------------------------ reading
+
+    def _check_size(self) -> None:
+        """Refuse a scene that takes long to compile, whatever part of it the robot is."""
+        count = len(self.spec.bodies)
+        if count > _MAX_SCENE_BODIES:
+            raise UrdfError(self.path, "<body>", f"{count} of them", f"at most {_MAX_SCENE_BODIES} in a scene")
 
     def _drop_files(self) -> tuple[list[tuple[Any, MeshShape]], list[Any]]:
         """Drop textures and such meshes as give no body its inertia.
@@ -335,8 +342,8 @@ class MjcfModel:
 
 @cache
 def _try_to_read(path: Path, _: int) -> None:
-    """Let the process with limits read a file that may stand for far more than it holds; `_`: when it was written."""
-    accepted = "a smaller model: see hfield, replicate, composite, model"
+    """Let the process with limits read a file first; `_`: when it was written."""
+    accepted = "fewer elements, those of hfield, replicate, composite and attach among them"
     try:
         with open_apart(_read_mjcf, path):
             pass
