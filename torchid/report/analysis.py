@@ -11,14 +11,14 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
-from rich.text import Text
 
 from torchid.errors import format_count, format_percent
 from torchid.fitting.left_out import Evidence
 from torchid.identifiability.base_parameters import BaseParameters, format_base_parameters, unobservable_parameters
 from torchid.problem import Metrics
 from torchid.problem.metrics import ROW_GROUPS, group_name
-from torchid.report.figure_style import MEASURED_COLOR, STYLE, label_decades
+from torchid.report.figure_style import MEASURED_COLOR, STYLE, label_decades, label_ticks
+from torchid.report.tables import make_table
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.observability import BaseObservability, Candidate, LostBase, PostureSummary
 from torchid.sensor_planning.planner import PartPlan, SensorPlan
@@ -131,46 +131,45 @@ def candidate_names(chosen: Sequence[Candidate]) -> str:
 
 def branch_table(plan: SensorPlan) -> Table:
     """Branches of the robot, the contacts that constrain them, and the sensors that each group of contacts needs."""
-    table = _table("Branches", "branch", "contacts beyond it", "sensors needed")
     no_sensors = "" if plan.problem.robot.fixed_base else "none"
+    rows = []
     for branch in plan.branches:
-        needed = [
-            f"{n.fewest_readings} for {' + '.join(n.contacts)}" for n in plan.requirements if branch.name in n.branches
-        ]
-        contacts = ", ".join(branch.contacts) or "free"
-        table.add_row(Text(branch.name), Text(contacts), Text("; ".join(needed) or no_sensors))
-    for group in plan.requirements:
-        if not group.branches:
-            table.add_row("(base)", Text(", ".join(group.contacts)), str(group.fewest_readings))
-    return table
+        groups = [group for group in plan.requirements if branch.name in group.branches]
+        needed = "; ".join(f"{group.fewest_readings} for {' + '.join(group.contacts)}" for group in groups)
+        rows.append((branch.name, ", ".join(branch.contacts) or "free", needed or no_sensors))
+    of_base = [group for group in plan.requirements if not group.branches]
+    rows += [("(base)", ", ".join(group.contacts), str(group.fewest_readings)) for group in of_base]
+    return make_table("Branches", ("branch", "contacts beyond it", "sensors needed"), rows)
 
 
 def sets_table(parts: Sequence[PartPlan]) -> Table:
     """The cheapest sets of every part of the robot, most informative first."""
-    table = _table("Smallest sets, most informative first", "contacts", "minimal sets", "bits", "sensors")
+    rows = []
     for part in parts:
-        for index, (bits, chosen) in enumerate(part.ranked[:_MAX_SETS]):
-            first = index == 0
-            count = "" if not first else "not counted" if part.sets is None else str(len(part.sets))
-            table.add_row(
-                Text(", ".join(part.frames) if first else ""), count, f"{bits:.1f}", Text(candidate_names(chosen))
-            )
+        begins = ", ".join(part.frames), "not counted" if part.sets is None else str(len(part.sets))
+        for bits, chosen in part.ranked[:_MAX_SETS]:
+            rows.append((*begins, f"{bits:.1f}", candidate_names(chosen)))
+            begins = "", ""
         if len(part.ranked) > _MAX_SETS:
-            table.add_row("", "", "", f"({len(part.ranked) - _MAX_SETS} more in analysis.json)")
-    return table
+            rows.append(("", "", "", f"({len(part.ranked) - _MAX_SETS} more in analysis.json)"))
+    headings = ("contacts", "minimal sets", "bits", "sensors")
+    return make_table("Smallest sets, most informative first", headings, rows, left=("sensors",))
 
 
 def observability_table(title: str, states: Sequence[BaseObservability]) -> Table:
     """rank(S_b V_x) and its smallest singular value over random postures, at position zero and over the logs."""
-    table = _table(f"{title}: rank(S_b V_x), its smallest singular value", "in contact")
-    table.columns[0].ratio = 1
-    for heading in ("rank", "median", "5 %", "zero\nposture", "logs\nmedian", "logs\nleast"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for state in states:
+
+    def row(state: BaseObservability) -> Sequence[str]:
         zero = f"rank {state.zero.rank}" if state.zero.rank < state.generic.rank else f"{state.zero.least:.2g}"
         logs = ("-", "-") if state.recorded is None else (f"{state.recorded.median:.2g}", f"{state.recorded.least:.2g}")
         random = (f"{state.generic.rank} of 6", f"{state.generic.median:.2g}", f"{state.generic.low:.2g}")
-        table.add_row(Text(state.name), *random, zero, *logs)
+        return (state.name, *random, zero, *logs)
+
+    headings = ("in contact", "rank", "median", "5 %", "zero\nposture", "logs\nmedian", "logs\nleast")
+    table = make_table(f"{title}: rank(S_b V_x), its smallest singular value", headings, map(row, states))
+    table.columns[0].ratio = 1
+    for column in table.columns[1:]:
+        column.no_wrap = True
     return table
 
 
@@ -231,18 +230,11 @@ def removal_table(plan: SensorPlan) -> Table:
         f"Without one sensor (inertial combinations: {plan.stack_rank} with this set, "
         f"{plan.stack_full} with every candidate)"
     )
-    table = _table(title, "without", "rank(S_b V_x) of each sample", "combinations, all samples together")
-    for removal in plan.removals:
-        rank = "fixed base" if removal.base_rank is None else f"{removal.base_rank} of 6"
-        table.add_row(Text(removal.candidate.name), rank, str(removal.stack_rank))
-    return table
-
-
-def _table(title: str, *headings: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    for index, heading in enumerate(headings):
-        table.add_column(heading, overflow="fold", justify="left" if index == 0 or heading == "sensors" else "right")
-    return table
+    rows = (
+        (x.candidate.name, "fixed base" if x.base_rank is None else f"{x.base_rank} of 6", str(x.stack_rank))
+        for x in plan.removals
+    )
+    return make_table(title, ("without", "rank(S_b V_x) of each sample", "combinations, all samples together"), rows)
 
 
 @dataclass(frozen=True)
@@ -270,18 +262,15 @@ class SetAccuracy:
 
 def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
     """Rms error by group of rows, where it was measured."""
-    title = "Accuracy of sensor sets, rms error on the test logs"
-    table = Table(title=title, title_justify="left")
-    longest = max(map(len, sets), default=0)
-    table.add_column("sensors", overflow="fold", min_width=min(longest, _LONGEST_NAME))
-    table.add_column("channels", justify="right")
-    table.add_column("rank", justify="right")
-    for label in ROW_GROUPS.values():
-        table.add_column(Text(label.replace(" [", "\n[")), justify="right")
-    for name, found in sets.items():
-        errors = {} if found.measured is None else found.measured.rms
-        numbers = (_number(errors.get(group)) for group in ROW_GROUPS)
-        table.add_row(Text(name), str(found.channels), str(found.rank), *numbers)
+
+    def row(name: str, accuracy: SetAccuracy) -> Sequence[str]:
+        errors = {} if accuracy.measured is None else accuracy.measured.rms
+        numbers = ("-" if (x := errors.get(group)) is None else f"{x:.3g}" for group in ROW_GROUPS)
+        return name, str(accuracy.channels), str(accuracy.rank), *numbers
+
+    headings = ("sensors", "channels", "rank", *(label.replace(" [", "\n[") for label in ROW_GROUPS.values()))
+    table = make_table("Accuracy of sensor sets, rms error on the test logs", headings, (row(*x) for x in sets.items()))
+    table.columns[0].min_width = min(max(map(len, sets), default=0), _LONGEST_NAME)
     return table
 
 
@@ -300,10 +289,12 @@ ALL_OF = "all sensors of kind "
 
 def left_out_table(without: Mapping[str, Evidence]) -> Table:
     """Change of the error of the other sensors' rows on left-out blocks by leaving a sensor out, the best first."""
-    table = _table("Each sensor left out: error of the others on left-out blocks", "without", "change", "certain")
-    for name, one in sorted(without.items(), key=lambda pair: -pair[1].gain):
-        table.add_row(Text(name), str(one), "yes" if one.certain else "no")
-    return table
+    rows = (
+        (name, str(evidence), "yes" if evidence.certain else "no")
+        for name, evidence in sorted(without.items(), key=lambda pair: -pair[1].gain)
+    )
+    title = "Each sensor left out: error of the others on left-out blocks"
+    return make_table(title, ("without", "change", "certain"), rows)
 
 
 def contradicting_messages(without: Mapping[str, Evidence]) -> list[str]:
@@ -312,10 +303,6 @@ def contradicting_messages(without: Mapping[str, Evidence]) -> list[str]:
     smaller = [(name, format_percent(-np.expm1(0.5 * loss))) for _, loss, name in worse]
     advice = "check gain, axes and offset: torchid check"
     return [f"without {name} errors of the others are {share} % smaller; {advice}" for name, share in smaller]
-
-
-def _number(x: float | None) -> str:
-    return "-" if x is None else f"{x:.3g}"
 
 
 @matplotlib.rc_context(STYLE)
@@ -332,7 +319,7 @@ def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
         axis.set_yscale("log")
         axis.margins(x=0.3 / max(len(measured) - 1, 1), y=0.15)
         label_decades(axis.yaxis)
-        axis.set_xticks(index, list(measured), rotation=40, ha="right")
+        label_ticks(axis.xaxis, index, list(measured), rotation=40, ha="right")
         axis.set_title(group_name(group), loc="left", fontsize=9)
         axis.set_ylabel(f"rms error {ROW_GROUPS[group][ROW_GROUPS[group].index('[') :]}")
     return figure

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from torchid.errors import during, escape
 from torchid.parallel import share_between_forks, thread_count
@@ -43,6 +44,9 @@ STYLE: dict[Any, Any] = {
 _PLAIN_DECADES, _ROUNDING = 3.0, 1e-9
 _FEW_DECADES = 1e3  # span of an axis on which 2 and 5 are labelled, too
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+#: Room of `draw_panels` at the left, with numbers and a unit, at the right, and between columns [inches].
+_LEFT, _RIGHT, _ACROSS = 0.8, 0.1, 0.6
+_HEADLINE = 0.08  # inches above a title
 #: 5 % larger than with the usual 6, in two thirds of the time.
 _COMPRESSION = 3
 #: Dates in files, without which the same run writes the same files.
@@ -62,7 +66,7 @@ def figure_bytes(figure: Figure, form: str) -> bytes:
     """
     content = io.BytesIO()
     with matplotlib.rc_context(STYLE):
-        for text in figure.findobj(Text):
+        for text in _texts(figure):
             text.set_text(escape(text.get_text(), "\n"))
         figure.set_dpi(130)
         if form == "png":
@@ -71,6 +75,22 @@ def figure_bytes(figure: Figure, form: str) -> bytes:
         else:
             figure.savefig(content, format=form, metadata={_DATES[form]: None})
     return content.getvalue()
+
+
+def _texts(figure: Figure) -> Iterator[Text]:
+    """The texts of a figure but those of ticks, which `findobj` would create one by one: see `label_ticks`."""
+    legends = [*figure.legends, *(legend for axes in figure.axes if (legend := axes.get_legend()) is not None)]
+    for legend in legends:
+        yield from legend.get_texts()
+    yield from figure.texts
+    for axes in figure.axes:
+        children = (*axes.get_children(), axes.xaxis.label, axes.yaxis.label)
+        yield from (child for child in children if isinstance(child, Text))
+
+
+def label_ticks(axis: Axis, positions: Sequence[float] | np.ndarray, names: Sequence[str], **style: Any) -> None:
+    """Name places of an axis, control characters as escapes."""
+    axis.set_ticks(positions, [escape(name, "\n") for name in names], **style)
 
 
 def save_figures(figures: Mapping[str, Figure], folder: Path, form: str) -> None:
@@ -98,6 +118,41 @@ def draw_for(path: Path, make: Callable[[], Figure]) -> Drawn:
         return Drawn(file, file if form == "png" else figure_bytes(figure, "png"))
 
 
+def draw_panels(
+    rows: int,
+    columns: int,
+    size: tuple[float, float],
+    *,
+    top: float = 0.6,
+    bottom: float,
+    down: float,
+    **options: Any,
+) -> tuple[Figure, np.ndarray]:
+    """A figure with panels whose ticks are numbers, at fixed places: constrained layout takes as long as drawing.
+
+    Args:
+        rows: of panels.
+        columns: likewise.
+        size: width and height [inches].
+        top: room above the panels [inches].
+        bottom: room below them.
+        down: room between rows.
+        options: of `Figure.subplots`.
+    """
+    width, height = size
+    panel_width = (width - _LEFT - _RIGHT - _ACROSS * (columns - 1)) / columns
+    panel_height = (height - top - bottom - down * (rows - 1)) / rows
+    edges = {"left": _LEFT / width, "right": 1.0 - _RIGHT / width, "bottom": bottom / height, "top": 1.0 - top / height}
+    between = {"wspace": _ACROSS / panel_width, "hspace": down / panel_height}
+    figure = Figure(figsize=size)
+    return figure, figure.subplots(rows, columns, squeeze=False, gridspec_kw=edges | between, **options)
+
+
+def set_headline(figure: Figure, text: str) -> None:
+    """Write the title of a figure of `draw_panels` into its upper left corner."""
+    figure.suptitle(text, x=0.01, y=1.0 - _HEADLINE / figure.get_figheight(), ha="left")
+
+
 def decade(value: float) -> str:
     """A power of ten as axes show it; what matplotlib writes is a formula, which names forbid (`STYLE`)."""
     exponent = math.log10(value)
@@ -106,14 +161,9 @@ def decade(value: float) -> str:
     return "10" + str(round(exponent)).translate(_SUPERSCRIPTS)
 
 
-def decade_formatter() -> FuncFormatter:
-    """Of the ticks of a logarithmic axis."""
-    return FuncFormatter(lambda value, _: decade(value))
-
-
 def label_decades(axis: Axis) -> None:
-    """Label 1, 2 and 5 of each power of ten of a logarithmic axis, however little of one it spans."""
+    """Label powers of ten of a logarithmic axis, and 2 and 5 times these where it spans few of them."""
     low, high = sorted(axis.get_view_interval())
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)))
-    axis.set_major_formatter(decade_formatter())
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: decade(value)))
+    axis.set_minor_locator(NullLocator())

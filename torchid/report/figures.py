@@ -36,8 +36,8 @@ from torchid.report.figure_style import (
     NOMINAL_COLOR,
     STYLE,
     decade,
-    decade_formatter,
     label_decades,
+    label_ticks,
 )
 from torchid.report.tables import MARKS, marks_legend
 from torchid.robot import Robot
@@ -99,7 +99,7 @@ def parameter_figure(
     impossible |= parameters.consistency_margin(after) < parameters.POSSIBLE_MARGIN
     names = [(_IMPOSSIBLE if bad else "") + body_names[int(k)] for k, bad in zip(shown, impossible, strict=True)]
     first = axes[titles[0]]
-    first.set_yticks(range(len(shown)), names, fontsize=7)
+    label_ticks(first.yaxis, range(len(shown)), names, fontsize=7)
     first.set_ylim(len(shown) - 0.4, -0.6)
     figure.legend(handles=_legend(first, of, bool(impossible.any())), loc="outside upper right", ncols=4)
     return figure
@@ -191,7 +191,7 @@ def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str]
         faces = [colors[log] if x.separable else "white" for x in points]
         axis.scatter(values, index, c=faces, edgecolors=colors[log], s=22, zorder=3)
     axis.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
-    axis.set_yticks(range(len(rows)), rows, fontsize=8)
+    label_ticks(axis.yaxis, range(len(rows)), rows, fontsize=8)
     axis.set_ylim(len(rows) - 0.5, -0.5)
     margin = _MARGIN * (max(*ends, 0.0) - min(*ends, 0.0))
     axis.set_xlim(min(*ends, 0.0) - margin, max(*ends, 0.0) + margin)
@@ -351,12 +351,12 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
             color = "white" if share[row, column] > 0.6 else "black"
             left.text(column, row, MARKS[verdict], ha="center", va="center", fontsize=8, color=color, in_layout=False)
     left.set_xticks(range(len(free)), [PARAMETERS[int(k)] for k in free], fontsize=7)
-    left.set_yticks(range(len(shown)), [body_names[int(body)] for body in shown], fontsize=7)
+    label_ticks(left.yaxis, range(len(shown)), [body_names[int(body)] for body in shown], fontsize=7)
     left.set_title(marks_legend(), loc="left", fontsize=8)
     figure.colorbar(image, ax=left, label="share of the data", pad=0.01)
     values = estimate.singular_values
     right.semilogy(np.arange(1, len(values) + 1), values, ".", color=IDENTIFIED_COLOR, markersize=4)
-    right.yaxis.set_major_formatter(decade_formatter())
+    label_decades(right.yaxis)
     right.axvline(estimate.rank + 0.5, color="0.5", linewidth=0.8)
     right.set_title(f"singular values, rank {estimate.rank}", loc="left", fontsize=8)
     right.set_xlabel("number")
@@ -384,7 +384,7 @@ def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]]) -> Fi
         names, bits = zip(*pairs, strict=True)
         bars = axis.barh(range(len(pairs)), bits, 0.7, color=IDENTIFIED_COLOR)
         axis.bar_label(bars, fmt="%.3g", fontsize=8, padding=2)
-        axis.set_yticks(range(len(pairs)), [fill(name, 60) for name in names], fontsize=7)
+        label_ticks(axis.yaxis, range(len(pairs)), [fill(name, 60) for name in names], fontsize=7)
         axis.set_ylim(len(pairs) - 0.4, -0.6)
         axis.grid(visible=False, axis="y")
         hidden = len(groups[group]) - len(pairs)
@@ -637,7 +637,7 @@ def drift_figure(
     if min(nominal.min(), identified.min()) > 0.0:
         joints.set_xscale("log")
         label_decades(joints.xaxis)
-    joints.set_yticks(rows, list(by_joint))
+    label_ticks(joints.yaxis, rows, list(by_joint))
     joints.invert_yaxis()
     joints.set_xlabel(f"median drift after {time[-1]:g} s [{', '.join(dict.fromkeys(units))}]")
     figure.suptitle(f"Drift of a robot driven by {driven}: median of windows, and quartiles", x=0.01, ha="left")

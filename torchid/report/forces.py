@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import NullFormatter
 
 from torchid.logs.low_pass import import_signal
 from torchid.parameters import Array
@@ -22,8 +22,9 @@ from torchid.report.figure_style import (
     NOISE_COLOR,
     NOMINAL_COLOR,
     STYLE,
-    decade_formatter,
+    draw_panels,
     label_decades,
+    set_headline,
 )
 
 _NOISE = "0.8"
@@ -34,6 +35,7 @@ _SHOWN = 1.6  # errors are shown up to so many times the largest of the identifi
 _BINS = 1000  # of an envelope, each a minimum and a maximum
 _MOST_SPANS = 300  # of contact states
 _NAMED_STATES = 11  # in the legend
+_CURVES, _LEGEND_ROW = 4, 0.2  # entries of the legend beside those, and height of a row [inches]
 _GAP = 5.0  # median steps that are a gap
 _SHORTEST, _LONGEST = 64, 1024  # samples of a window of a spectrum
 _BEYOND = 2.0  # frequencies are shown up to so many times the band of the noise
@@ -87,8 +89,12 @@ def _figure(
     """Some rows over time, by name and unit, and their errors; `states` are further marks of the legend."""
     series, since = _from_its_start(series)
     thin = _Thinned(series.time)
-    figure = Figure(figsize=(12.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
-    axes = figure.subplots(max(len(rows), 1), 2, sharex=True, squeeze=False, width_ratios=(3, 2))
+    columns = 3 if states else 4  # of the legend
+    legend = _LEGEND_ROW * -(-(_CURVES + len(states)) // columns)
+    size = 12.0, 1.7 * max(len(rows), 1) + 0.8
+    figure, axes = draw_panels(
+        max(len(rows), 1), 2, size, bottom=0.5 + legend, down=0.36, sharex=True, width_ratios=(3, 2)
+    )
     for (forces, errors), (row, (name, unit)) in zip(axes, rows.items(), strict=False):
         for values, color, width, label in (
             (series.measured, MEASURED_COLOR, 1.6, "measured"),
@@ -102,12 +108,12 @@ def _figure(
     if rows:
         handles, labels = (a + b for a, b in zip(*(x.get_legend_handles_labels() for x in axes[0]), strict=True))
         labels += [str(patch.get_label()) for patch in states]
-        figure.legend([*handles, *states], labels, loc="outside lower center", ncols=3 if states else 4)
+        figure.legend([*handles, *states], labels, loc="lower center", ncols=columns)
     for axis in axes[-1]:
         axis.set_xlabel(f"time{since} [s]")
     if len(series.time) and 0.0 <= series.time[0] < _NEAR_0 * series.time[-1]:
         axes[0, 0].set_xlim(left=0.0)
-    figure.suptitle(f"{title}, and errors: predicted - measured{gaps}", x=0.01, ha="left")
+    set_headline(figure, f"{title}, and errors: predicted - measured{gaps}")
     return figure
 
 
@@ -191,10 +197,11 @@ def rows_figure(
     colors = {k: CATEGORY_COLORS[place % len(CATEGORY_COLORS)] for place, k in enumerate(colored)}
     patches = [Patch(color=color, alpha=0.25, label=forces.states[k]) for k, color in colors.items()]
     figure = _figure(series, names, f"Rows of the fit, {series.source}", of, states=patches[:_NAMED_STATES])
-    for axis in figure.axes:
-        for start, end, number in spans:
-            if number in colors:
-                axis.axvspan(start, end, color=colors[number], alpha=0.25, linewidth=0.0, zorder=0)
+    for state, color in colors.items():
+        stays = [(start, end - start) for start, end, number in spans if number == state]
+        for axis in figure.axes:
+            style: dict[str, Any] = {"color": color, "alpha": 0.25, "linewidth": 0.0, "zorder": 0}
+            axis.broken_barh(stays, (0.0, 1.0), transform=axis.get_xaxis_transform(), **style)
     return figure
 
 
@@ -207,31 +214,34 @@ def spectrum_figure(
     names = _largest(series, dof_names, base_rows, sliding)
     spectra = {row: _spectrum(series, row, series.time - series.time[0], forces.bandwidth) for row in names}
     shown = {row: spectrum for row, spectrum in spectra.items() if spectrum is not None}
-    figure = Figure(figsize=(12.0, 2.2 * -(-max(len(shown), 1) // 3) + 0.8), layout="constrained")
+    rows = -(-max(len(shown), 1) // 3)
+    size = 12.0, 2.2 * rows + 0.8
     if not shown:
-        figure.suptitle("Residuals by frequency: the log has no segment that is long enough", x=0.01, ha="left")
+        figure = Figure(figsize=size)
+        set_headline(figure, "Residuals by frequency: the log has no segment that is long enough")
         return figure
-    axes = figure.subplots(-(-len(shown) // 3), min(len(shown), 3), squeeze=False).ravel()
+    scales = {"xscale": "log", "yscale": "log"}
+    figure, grid = draw_panels(rows, min(len(shown), 3), size, bottom=0.75, down=0.7, subplot_kw=scales)
+    axes = grid.ravel()
     for axis, (row, spectrum) in zip(axes, shown.items(), strict=False):
         for density, color, label in (
             (spectrum.nominal, NOMINAL_COLOR, f"error, {of}"),
             (spectrum.identified, IDENTIFIED_COLOR, "error, identified"),
         ):
-            axis.loglog(spectrum.frequency, density, color=color, linewidth=1.2, label=label)
+            axis.plot(spectrum.frequency, density, color=color, linewidth=1.2, label=label)
         if spectrum.noise is not None:
             band = [spectrum.frequency[0], forces.bandwidth]
-            axis.loglog(band, [spectrum.noise] * 2, "--", color=NOISE_COLOR, label="noise of the readings")
+            axis.plot(band, [spectrum.noise] * 2, "--", color=NOISE_COLOR, label="noise of the readings")
         name, unit = names[row]
         axis.set_title(f"{name} [{unit}/√Hz]", loc="left", fontsize=9)
         axis.set_xlabel("frequency [Hz]")
         label_decades(axis.xaxis)
-        axis.yaxis.set_major_formatter(decade_formatter())
-        axis.yaxis.set_minor_formatter(NullFormatter())
+        label_decades(axis.yaxis)
     for axis in axes[len(shown) :]:
         axis.remove()
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncols=3)
     title = f"Residuals by frequency in the rows of the fit, {series.source}: above the noise lies what the model lacks"
-    figure.suptitle(title, x=0.01, ha="left")
+    set_headline(figure, title)
     return figure
 
 

@@ -21,7 +21,7 @@ from torchid.log_checks.findings import channel_names, channel_unit
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.time_range import log_title
-from torchid.report.figure_style import IDENTIFIED_COLOR, NOMINAL_COLOR, STYLE
+from torchid.report.figure_style import IDENTIFIED_COLOR, NOMINAL_COLOR, STYLE, label_ticks
 
 COLORS = {REJECTED: NOMINAL_COLOR, SUSPICIOUS: "#e69f00", NOTE: IDENTIFIED_COLOR}
 #: Height of a row and of a panel's title, and width of the figure [inches].
@@ -96,7 +96,7 @@ def _draw_panel(axes: Axes, checked: Checked) -> None:
                 if finding.field in (field, "time") and span.channel in ("", name):
                     axes.broken_barh([(0.5 * (start + end) - 0.5 * width, width)], (height - 0.5, 1.0), **style)
     axes.set(xlim=(time[0], max(time[-1], 1e-9)), ylim=(-len(channels) + 0.4, 0.6), xlabel="time [s]")
-    axes.set_yticks(heights, [f"{field} {name}" for field, name in channels], fontsize=6)
+    label_ticks(axes.yaxis, heights, [f"{field} {name}" for field, name in channels], fontsize=6)
     axes.tick_params(axis="y", length=0)
     ranges = axes.secondary_yaxis("right")
     ranges.set_yticks(heights, [_range_text(*channel, values) for channel, values in channels.items()], fontsize=6)

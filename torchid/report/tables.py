@@ -6,7 +6,7 @@ import io
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -22,6 +22,7 @@ from torchid.errors import escape, raw_stream
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
 from torchid.fitting.calibration import Comparison
+from torchid.fitting.noise import GroupNoise
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.information import Contribution, Contributions, PartContribution
 from torchid.kernels import compiling_announced
@@ -74,6 +75,34 @@ def table_text(table: Table, width: int = WIDTH) -> str:
     return captured.get()
 
 
+def make_table(
+    title: str,
+    headings: Sequence[str],
+    rows: Iterable[Sequence[str] | None],
+    left: Collection[str] = (),
+    style: box.Box = box.HEAVY_HEAD,
+) -> Table:
+    """A table of texts.
+
+    Args:
+        title: above it.
+        headings: of the columns.
+        rows: as many texts each as there are headings, or fewer; None is a line between them.
+        left: headings of columns that are not aligned to the right, beside the first.
+        style: of the borders.
+    """
+    table = Table(title=title, title_justify="left", box=style)
+    for number, heading in enumerate(headings):
+        is_left = number == 0 or heading in left
+        table.add_column(Text(heading), justify="left" if is_left else "right", overflow="fold")
+    for row in rows:
+        if row is None:
+            table.add_section()
+        else:
+            table.add_row(*map(Text, row))
+    return table
+
+
 def error_tables(columns: Mapping[str, Comparison[Metrics]], of: str) -> list[Table]:
     """Errors of predicted forces, nominal (`of` a URDF or MJCF) against identified, two sets of logs to a table."""
     sets = list(columns.items())
@@ -81,29 +110,25 @@ def error_tables(columns: Mapping[str, Comparison[Metrics]], of: str) -> list[Ta
 
 
 def _error_table(columns: Mapping[str, Comparison[Metrics]], of: str) -> Table:
-    table = Table(
-        title="Error of predicted forces: rms, and share of the rms of the measured; -: not measured",
-        title_justify="left",
-    )
-    table.add_column("", no_wrap=True)
-    for name in columns:
-        for parameter_set in (of, "identified"):
-            table.add_column(Text(f"{name}\n{parameter_set}"), justify="right", overflow="fold")
-    limbs = dict(LIMB_GROUPS) if any(pair.identified.limb_rms for pair in columns.values()) else {}
-    limbs |= PRESSURE_GROUP if any(PRESSURE in pair.identified.rms for pair in columns.values()) else {}
-    for group, label in (ERROR_GROUPS | limbs).items():
-        errors = [_error_cell(m, group) for pair in columns.values() for m in pair]
-        table.add_row(Text(label), *errors)
-        if group == "joint_torque" and any(pair.identified.limbs_in_air for pair in columns.values()):
-            limited = ("only" if pair.identified.limbs_in_air else "" for pair in columns.values())
-            table.add_row(f"  {IN_AIR}", *(cell for text in limited for cell in ("", text)))
+    headings = ["", *(f"{name}\n{parameter_set}" for name in columns for parameter_set in (of, "identified"))]
+    identified = [pair.identified for pair in columns.values()]
+    groups = ERROR_GROUPS | (LIMB_GROUPS if any(x.limb_rms for x in identified) else {})
+    groups |= PRESSURE_GROUP if any(PRESSURE in x.rms for x in identified) else {}
+    rows: list[list[str]] = []
+    for group, label in groups.items():
+        rows.append([label, *(_error_cell(m, group) for pair in columns.values() for m in pair)])
+        if group == "joint_torque" and any(x.limbs_in_air for x in identified):
+            rows.append([f"  {IN_AIR}", *(y for x in identified for y in ("", "only" if x.limbs_in_air else ""))])
         if group == "base_force":
             shares = [m.base_force_of_variation for pair in columns.values() for m in pair]
-            table.add_row("  of its variation", *("-" if x is None else f"({100 * x:.3g} %)" for x in shares))
-        floors = [pair.identified.noise.get(group) for pair in columns.values()]
+            rows.append(["  of its variation", *("-" if x is None else f"({100 * x:.3g} %)" for x in shares)])
+        floors = [x.noise.get(group) for x in identified]
         if any(floor is not None for floor in floors):
-            cells = (("", "-" if floor is None else f"{floor:.4g}") for floor in floors)
-            table.add_row("  noise alone", *(cell for pair in cells for cell in pair))
+            texts = ("-" if floor is None else f"{floor:.4g}" for floor in floors)
+            rows.append(["  noise alone", *(y for text in texts for y in ("", text))])
+    title = "Error of predicted forces: rms, and share of the rms of the measured; -: not measured"
+    table = make_table(title, headings, rows)
+    table.columns[0].no_wrap = True
     return table
 
 
@@ -116,20 +141,20 @@ def _error_cell(metrics: Metrics, group: str) -> str:
 
 def state_table(states: Sequence[Mapping[str, Any]]) -> Table:
     """Contact states with sample counts, rows per sample, and the rank of the base."""
-    table = Table(title="Contact states", title_justify="left")
-    for heading in ("in contact", "samples", "rows each", "rank(S_b V_x)", "at full rank", "smallest s.v."):
-        table.add_column(heading, justify="left" if heading == "in contact" else "right")
-    for state in states:
-        rank, smallest = state["base_rank"], state["base_singular_value"]
-        table.add_row(
-            Text(str(state["name"])),
+
+    def row(state: Mapping[str, Any]) -> Sequence[str]:
+        rank, smallest, rows = state["base_rank"], state["base_singular_value"], str(state["rows"])
+        return (
+            str(state["name"]),
             str(state["samples"]),
-            str(state["rows"]) if state["mean_rows"] is None else f"{state['mean_rows']:.2g} of {state['rows']}",
+            rows if state["mean_rows"] is None else f"{state['mean_rows']:.2g} of {rows}",
             "fixed base" if rank is None else f"{rank} of 6",
             _rank_share_cell(state),
             "" if smallest is None else f"{smallest:.2g}",
         )
-    return table
+
+    headings = ("in contact", "samples", "rows each", "rank(S_b V_x)", "at full rank", "smallest s.v.")
+    return make_table("Contact states", headings, map(row, states))
 
 
 def _rank_share_cell(state: Mapping[str, Any]) -> str:
@@ -141,16 +166,19 @@ def _rank_share_cell(state: Mapping[str, Any]) -> str:
     return f"{100 * full:.3g} %" + (f" (least: {lowest})" if lowest < 6 else "")
 
 
-def noise_table(groups: Sequence[Mapping[str, Any]]) -> Table:
-    """Standard deviations that weight the rows, by group: fields of `GroupNoise`."""
+def noise_table(groups: Sequence[GroupNoise]) -> Table:
+    """Standard deviations that weight the rows, by group."""
     title = "Noise that weights the rows: standard deviations; residuals show what a filter leaves of it"
-    table = Table(title=title, title_justify="left")
-    for heading in ("", "used", "origin", "residuals show"):
-        table.add_column(heading, justify="left" if heading in ("", "origin") else "right")
-    for group in groups:
-        residual = "-" if group["residual"] is None else f"{group['residual']:.3g} {group['unit']}"
-        table.add_row(group["group"], f"{group['used']:.3g} {group['unit']}", group["origin"], residual)
-    return table
+    rows = (
+        (
+            x.group,
+            f"{x.used:.3g} {x.unit}",
+            x.origin,
+            "-" if x.residual is None else f"{x.residual:.3g} {x.unit}",
+        )
+        for x in groups
+    )
+    return make_table(title, ("", "used", "origin", "residuals show"), rows, left=("origin",))
 
 
 def noise_advice(suggested: Mapping[str, Any]) -> str:
@@ -186,42 +214,38 @@ def verdict_table(body_names: Sequence[str], verdicts: np.ndarray) -> Table:
 
 def verdict_counts_table(by_state: Mapping[str, Estimate], together: Estimate) -> Table:
     """Rank, condition number and numbers of parameters by verdict, of each contact state alone and of all data."""
-    table = Table(title="Parameters by verdict, of each contact state alone and together", title_justify="left")
-    table.add_column("in contact", overflow="fold")
-    for heading in ("rank", "condition", *filter(None, MARKS.values())):
-        table.add_column(heading, justify="right")
-    for name, estimate in [*by_state.items(), ("together", together)]:
-        if name == "together":
-            table.add_section()
+
+    def row(name: str, estimate: Estimate) -> Sequence[str]:
         condition = f"{estimate.condition_number:.2g}" if estimate.rank else "-"
         counts = (str(count) for verdict, count in estimate.verdict_counts().items() if MARKS[verdict])
-        table.add_row(Text(name), str(estimate.rank), condition, *counts)
-    return table
+        return name, str(estimate.rank), condition, *counts
+
+    headings = ("in contact", "rank", "condition", *filter(None, MARKS.values()))
+    rows = [*(row(*pair) for pair in by_state.items()), None, row("together", together)]
+    return make_table("Parameters by verdict, of each contact state alone and together", headings, rows)
 
 
 def contribution_table(contributions: Contributions) -> Table:
     """Information that each log, contact state and sensor (if known) contributes, the largest of each kind."""
-    of_sensors = "contact state and sensor" if contributions.sensors else "and contact state"
-    comma = "," if contributions.sensors else ""
-    table = Table(title=f"What each log{comma} {of_sensors} adds: lost without it", title_justify="left")
-    for heading in ("", "samples", "rank alone", "rank lost", "combinations lost", "bits lost"):
-        table.add_column(heading, justify="right" if heading else "left", overflow="fold")
+    of_sensors = ", contact state and sensor" if contributions.sensors else " and contact state"
     kinds: dict[str, Sequence[Contribution]] = {
         "logs": contributions.logs, "contact states": contributions.states, "sensors": contributions.sensors
     }  # fmt: skip
+    rows: list[Sequence[str] | None] = []
     for kind, members in kinds.items():
         for member in sorted(members, key=lambda x: -x.bits)[:_MOST_ROWS]:
             counts = ("", "", "")
             if isinstance(member, PartContribution):
                 counts = (str(member.samples), str(member.rank), str(member.rank_lost))
             name = log_title(member.name) if kind == "logs" else member.name
-            table.add_row(Text(name), *counts, f"{member.determined:.1f}", f"{member.bits:.1f}")
+            rows.append((name, *counts, f"{member.determined:.1f}", f"{member.bits:.1f}"))
         if len(members) > _MOST_ROWS:
-            table.add_row(f"and {len(members) - _MOST_ROWS} more {kind}")
-        table.add_section()
+            rows.append((f"and {len(members) - _MOST_ROWS} more {kind}",))
+        rows.append(None)
     total = contributions.total
-    table.add_row("everything", "", "", "", f"{total.determined:.1f}", f"{total.bits:.1f}")
-    return table
+    rows.append(("everything", "", "", "", f"{total.determined:.1f}", f"{total.bits:.1f}"))
+    headings = ("", "samples", "rank alone", "rank lost", "combinations lost", "bits lost")
+    return make_table(f"What each log{of_sensors} adds: lost without it", headings, rows)
 
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
@@ -229,40 +253,11 @@ def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
     title = "Conditions that the identified parameters break"
     if len(violations) > _MOST_ROWS:
         title += f", the first {_MOST_ROWS} of {len(violations)}"
-    table = Table(title=title, title_justify="left")
-    for heading in ("body", "condition", "off by"):
-        table.add_column(heading, justify="right" if heading == "off by" else "left")
-    for violation in violations[:_MOST_ROWS]:
-        amount = Text(f"{violation['amount']:.3g} {violation['unit']}")
-        table.add_row(Text(violation["body"] or violation["term"] or "all"), Text(str(violation["condition"])), amount)
-    return table
-
-
-def stability_table(motions: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Stability of a simulated robot: fields of `Stability` by motion."""
-    table = Table(title="Standing", title_justify="left")
-    for heading in (
-        "motion",
-        "base height [m]",
-        "slip [mm]",
-        "zero-moment point inside by [mm]",
-        "effort [%]",
-        "feet up [%]",
-    ):
-        table.add_column(
-            Text(heading), justify="left" if heading == "motion" else "right"
-        )  # as Text: [m] is not markup
-    for name, stability in motions.items():
-        low, high = stability["base_height"]
-        table.add_row(
-            Text(name),
-            f"{low:.3f} to {high:.3f}",
-            f"{1e3 * stability['slip']:.1f}",
-            f"{1e3 * stability['zmp_margin']:.0f}",
-            f"{100 * stability['effort']:.0f}",
-            ", ".join(f"{100 * share:.0f}" for share in stability["unloaded"]),
-        )
-    return table
+    rows = (
+        (str(x["body"] or x["term"] or "all"), str(x["condition"]), f"{x['amount']:.3g} {x['unit']}")
+        for x in violations[:_MOST_ROWS]
+    )
+    return make_table(title, ("body", "condition", "off by"), rows, left=("condition",))
 
 
 _MAX_COLUMNS, _MAX_ROWS = 4, 30
@@ -272,23 +267,19 @@ def extra_table(extras: Sequence[ExtraEstimate]) -> Table:
     """Extra parameters with standard errors, a row for each, a column for each log; `parameters.json` has them all."""
     title = "Offsets, scales and actuators, with standard errors; ?: confounded with other parameters"
     title += "; |: at a physical bound" if any(x.at_bound for x in extras) else ""
-    table = Table(title=title, title_justify="left")
     logs = sorted(dict.fromkeys(x.log for x in extras), key=bool)  # terms common to all logs come first
+    units = {x.extra.label: x.extra.unit for x in reversed(extras)}
     labels = list(dict.fromkeys(x.extra.label for x in extras))
-    by_label = {(x.extra.label, x.log): x for x in extras}
-    table.add_column("", overflow="fold")
-    table.add_column("unit", no_wrap=True)
+    cells = {(x.extra.label, x.log): _extra_cell(x) for x in extras}
     shown = logs[:_MAX_COLUMNS]
-    for log in shown:
-        table.add_column(Text(log_title(log) or "all logs"), justify="right", overflow="fold")
-    for label in labels[:_MAX_ROWS]:
-        unit = next(x.extra.unit for x in extras if x.extra.label == label)
-        cells = (by_label.get((label, log)) for log in shown)
-        table.add_row(Text(label), unit, *("" if x is None else _extra_cell(x) for x in cells))
+    rows = [[name, units[name], *(cells.get((name, log), "") for log in shown)] for name in labels[:_MAX_ROWS]]
     hidden = {"row": len(labels) - _MAX_ROWS, "log": len(logs) - _MAX_COLUMNS}
-    rest = " and ".join(f"{count} {noun}{'s' * (count > 1)}" for noun, count in hidden.items() if count > 0)
-    if rest:
-        table.add_row(f"and {rest} more: parameters.json")
+    others = " and ".join(f"{count} {noun}{'s' * (count > 1)}" for noun, count in hidden.items() if count > 0)
+    if others:
+        rows.append([f"and {others} more: parameters.json"])
+    headings = ["", "unit", *(log_title(log) or "all logs" for log in shown)]
+    table = make_table(title, headings, rows, left=("unit",))
+    table.columns[1].no_wrap = True
     return table
 
 
