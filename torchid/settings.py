@@ -7,7 +7,16 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainValidator, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
 from pydantic_core import ErrorDetails
 
 
@@ -36,16 +45,16 @@ def _file_name(value: str) -> str:
     return value
 
 
-def _number_or(words: tuple[str | None, ...], number: Any, accepted: str) -> PlainValidator:
-    """A validator of some words, and of a type of number beside them: messages name both."""
+def described(accepted: str) -> WrapValidator:
+    """What a type accepts, in messages about its values, whatever pydantic would say of its parts."""
 
-    def validate(value: object) -> float | str | None:
+    def validate(value: object, handler: ValidatorFunctionWrapHandler) -> object:
         try:
-            return value if value in words else TypeAdapter(number).validate_python(value)
+            return handler(value)
         except ValueError as error:
             raise ValueError(accepted) from error
 
-    return PlainValidator(validate)
+    return WrapValidator(validate)
 
 
 STRICT = ConfigDict(extra="forbid")
@@ -56,32 +65,24 @@ AUTO: Literal["auto"] = "auto"
 
 Number = Annotated[float, BeforeValidator(_not_bool), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
-PositiveOrAuto = Annotated[
-    float | Literal["auto"] | None, _number_or((AUTO, None), Positive, "auto, null, or a number greater than 0")
-]
+Auto = Literal["auto"]
+PositiveOrAuto = Annotated[Positive | Auto | None, described("auto, null, or a number greater than 0")]
 """A positive number, one that the data choose, or none."""
-NumberOrAuto = Annotated[float | Literal["auto"] | None, _number_or((AUTO, None), Number, "auto, null, or a number")]
+NumberOrAuto = Annotated[Number | Auto | None, described("auto, null, or a number")]
 """A number, one that the data choose, or none."""
 NotNegative = Annotated[Number, Field(ge=0.0)]
-BoolOrAuto = Annotated[bool | Literal["auto"], _number_or((AUTO,), bool, "true, false, or auto")]
+BoolOrAuto = Annotated[bool | Auto, described("true, false, or auto")]
 """A switch, or one that the data set."""
-NotNegativeOrAuto = Annotated[
-    float | Literal["auto"], _number_or((AUTO,), NotNegative, "auto, or a number of at least 0")
-]
+NotNegativeOrAuto = Annotated[NotNegative | Auto, described("auto, or a number of at least 0")]
 """A number that is not negative, or one that the data choose."""
-NotNegativeAutoOrNone = Annotated[
-    float | Literal["auto"] | None, _number_or((AUTO, None), NotNegative, "auto, null, or a number of at least 0")
-]
+NotNegativeAutoOrNone = Annotated[NotNegative | Auto | None, described("auto, null, or a number of at least 0")]
 """A number that is not negative, one that the data choose, or none."""
-Ridge = Annotated[
-    float | Literal["auto", "one_standard_error"],
-    _number_or((AUTO, "one_standard_error"), NotNegative, "auto, one_standard_error, or a number of at least 0"),
-]
-"""A ridge, or how one is chosen."""
 FileName = Annotated[str, AfterValidator(_file_name)]
 Device = Annotated[str, AfterValidator(_torch_device)]
 RidgeRule = Literal["auto", "one_standard_error"]
 """Which ridge is chosen: the first unless a larger one predicts better, or the largest within one standard error."""
+Ridge = Annotated[NotNegative | RidgeRule, described("auto, one_standard_error, or a number of at least 0")]
+"""A ridge, or how one is chosen."""
 BelowOne = Annotated[Number, Field(ge=0.0, lt=1.0)]
 Tolerance = Annotated[Number, Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, BeforeValidator(_not_bool), Field(ge=1)]

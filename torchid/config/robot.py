@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BeforeValidator, Field, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError
@@ -15,12 +15,7 @@ from torchid.logs.signal_noise import STATED_FIELDS
 from torchid.problem.extras import CHANNELS
 from torchid.robot.tree import MAX_ANGLE, MAX_GAP, Loop
 from torchid.robot.xml_files import is_mjcf
-from torchid.settings import AUTO, STRICT, Name, NotNegative, NotNegativeOrAuto, Number, Positive
-
-
-def as_list(value: object) -> object:
-    """A tuple as a list, as YAML has it."""
-    return list(value) if isinstance(value, tuple) else value
+from torchid.settings import AUTO, STRICT, Auto, Name, NotNegative, NotNegativeOrAuto, Number, Positive, described
 
 
 def _at_zero(value: object) -> object:
@@ -36,32 +31,17 @@ MJCF_SUFFIXES = (".xml", ".mjcf")
 WELDS_ACCEPTED = "a list of joints or patterns, or a mapping to positions [rad or m]: {'*finger*': 0.3}"
 Welds = Annotated[dict[str, FiniteFloat], BeforeValidator(_at_zero)]
 
-
-def _tilt(value: object) -> object:
-    """Two angles, auto or none."""
-    if value is None or value == AUTO:
-        return value
-    try:
-        x, y = _ANGLES.validate_python(value)
-    except ValueError as error:
-        raise ValueError("auto, null, or two angles [rad] about the base's x and y axes: [0.01, -0.02]") from error
-    return x, y
-
-
-_ANGLES: TypeAdapter[list[float]] = TypeAdapter(Annotated[list[Number], Field(min_length=2, max_length=2)])
-BaseTilt = Annotated[tuple[float, float] | Literal["auto"] | None, PlainValidator(_tilt), PlainSerializer(as_list)]
-
+BaseTilt = Annotated[
+    tuple[Number, Number] | Auto | None,
+    described("auto, null, or two angles [rad] about the base's x and y axes: [0.01, -0.02]"),
+]
 
 LOOPS_ACCEPTED = "a list of mappings: [{frames: [l_rod_end, l_ankle_pin], type: point}]"
-
-
-def _frames(value: object) -> object:
-    if isinstance(value, (list, tuple)) and len(value) == 2 and all(isinstance(name, str) and name for name in value):
-        return list(value)
-    raise ValueError("two frames of the robot: [l_rod_end, l_ankle_pin]")
-
-
-Frames = Annotated[list[str], PlainValidator(_frames)]
+Frames = Annotated[
+    list[Name],
+    Field(min_length=2, max_length=2),
+    described("two frames of the robot: [l_rod_end, l_ankle_pin]"),
+]
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -156,44 +136,22 @@ WRENCHES_ACCEPTED = "a mapping from frames of contacts to components: {l_sole: [
 """Accepted for measured components of a contact, and of all contacts, in messages."""
 
 
-def _per_axis(value: object) -> float | tuple[float, float, float]:
-    """A positive number, or three."""
-    try:
-        if not isinstance(value, (list, tuple)):
-            return _POSITIVE.validate_python(value)
-        x, y, z = (_POSITIVE.validate_python(one) for one in value)
-    except ValueError as error:
-        raise ValueError("a number greater than 0, or three for the axes: [x, y, z]") from error
-    return x, y, z
+def _not_zero(vector: list[float]) -> list[float]:
+    if not any(vector):
+        raise ValueError("not all 0")
+    return vector
 
 
-def _normal(value: object) -> list[float] | None:
-    """Three numbers, not all 0, or none."""
-    try:
-        normal = None if value is None else _VECTOR.validate_python(value)
-    except ValueError:
-        normal = []
-    if normal is not None and not any(normal):
-        raise ValueError("three numbers [x, y, z] in the world, not all 0")
-    return normal
-
-
-_VECTOR: TypeAdapter[list[float]] = TypeAdapter(Annotated[list[Number], Field(min_length=3, max_length=3)])
-_POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
-PER_JOINT_ACCEPTED = "a number greater than 0, or one by name or pattern of the joints: {'*': 0.5, '*_wrist': 0.02}"
-
-
-def _per_joint(value: object) -> float | dict[str, float] | None:
-    """A positive number, or some by name or pattern of the joints."""
-    try:
-        return None if value is None else _POSITIVE_BY_NAME.validate_python(value)
-    except ValueError as error:
-        raise ValueError(PER_JOINT_ACCEPTED) from error
-
-
-_POSITIVE_BY_NAME: TypeAdapter[float | dict[str, float]] = TypeAdapter(Positive | dict[Name, Positive])
-PerJoint = Annotated[float | dict[str, float], PlainValidator(_per_joint)]
-PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis), PlainSerializer(as_list)]
+Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Normal = Annotated[Vector, AfterValidator(_not_zero), described("three numbers [x, y, z] in the world, not all 0")]
+PerJoint = Annotated[
+    Positive | dict[Name, Positive],
+    described("a number greater than 0, or one by name or pattern of the joints: {'*': 0.5, '*_wrist': 0.02}"),
+]
+PerAxis = Annotated[
+    Positive | tuple[Positive, Positive, Positive],
+    described("a number greater than 0, or three for the axes: [x, y, z]"),
+]
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -211,8 +169,8 @@ class ContactConfig:
     type: Literal["point", "line", "flat"]
     line_axis: Literal["x", "y", "z"] = "y"
     radius: NotNegativeOrAuto = AUTO
-    centre: Annotated[list[Number], Field(min_length=3, max_length=3)] | Literal["auto"] = AUTO
-    normal: Annotated[list[float] | None, PlainValidator(_normal)] = None
+    centre: Annotated[Vector | Auto, described("auto, or three numbers [x, y, z] in the frame [m]")] = AUTO
+    normal: Normal | None = None
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -273,31 +231,24 @@ def _every_channel(value: object) -> object:
     return dict.fromkeys(CHANNELS, value) if value in get_args(Scope) else value
 
 
-def _scope_or_groups(value: object) -> str | list[list[str]]:
-    """A scope, or groups of patterns, of which one alone needs no list."""
-    if isinstance(value, str) and value in get_args(Scope):
-        return value
-    groups = [[group] if isinstance(group, str) else group for group in value] if isinstance(value, list) else []
-    named = all(
-        isinstance(group, list) and group and all(isinstance(name, str) and name for name in group) for group in groups
-    )
-    if not (groups and named):
-        raise ValueError(GROUPS_ACCEPTED)
-    return groups
+def _group(value: object) -> object:
+    """A group of patterns, of which one alone needs no list."""
+    return [value] if isinstance(value, str) else value
 
+
+GROUPS_ACCEPTED = "log, all, or a list of groups of joints or frames: [[l_hip, r_hip], '*_knee']"
+"""Accepted for the scales of a kind of channels, in messages."""
 
 ChannelKind = Literal["joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment"]
 Scope = Literal["log", "all"]
 Scopes = Annotated[dict[ChannelKind, Scope], BeforeValidator(_every_channel)]
+Group = Annotated[list[Name], Field(min_length=1), BeforeValidator(_group)]
+Groups = Annotated[list[Group], Field(min_length=1)]
 Scales = Annotated[
-    dict[ChannelKind, Annotated[Scope | list[list[str]], PlainValidator(_scope_or_groups)]],
-    BeforeValidator(_every_channel),
+    dict[ChannelKind, Annotated[Scope | Groups, described(GROUPS_ACCEPTED)]], BeforeValidator(_every_channel)
 ]
 SCOPES_ACCEPTED = f"log, all, or a mapping from kinds of channels ({', '.join(CHANNELS)}) to log or all"
 """Accepted for `Scopes`, in messages."""
-
-GROUPS_ACCEPTED = "log, all, or a list of groups of joints or frames: [[l_hip, r_hip], '*_knee']"
-"""Accepted for the scales of a kind of channels, in messages."""
 
 
 @dataclass(config=STRICT, frozen=True)
