@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 import torchid
 from torchid.boundary import run_guarded
-from torchid.commands.results import Identification
+from torchid.commands.run_folder import Identification
 from torchid.identifiability.base_parameters import structural_problem
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import force_series, null_space_part

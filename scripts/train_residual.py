@@ -26,7 +26,7 @@ from torchid import JointNetworks, RigidPlusResidual
 from torchid.boundary import run_guarded
 from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.commands.identify import identify
-from torchid.commands.run_figures import hyperparameters
+from torchid.commands.run_folder import hyperparameters
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
 from torchid.estimators import Sgd, Trainer

@@ -13,11 +13,11 @@ from .commands.check import (
 from .commands.evaluate import (
     EvaluatedRun,
 )
-from .commands.named_results import (
+from .commands.results import (
     BodyEstimate,
     ParameterTable,
 )
-from .commands.results import (
+from .commands.run_folder import (
     Identification,
 )
 from .distributed import (

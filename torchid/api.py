@@ -14,7 +14,7 @@ from torchid.commands.check import EXPERIMENTS, CheckedLogs, check_experiment, c
 from torchid.commands.evaluate import EvaluatedRun, evaluate_identification
 from torchid.commands.evaluate import evaluate as evaluate_folder
 from torchid.commands.identify import identify as identify_settings
-from torchid.commands.results import Identification
+from torchid.commands.run_folder import Identification
 from torchid.config import load_analysis, load_config
 from torchid.config.settings_files import Sections, StrPath, plain_sections
 from torchid.errors import ConfigError, UnknownNameError, about_file

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import gc
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
@@ -259,22 +260,29 @@ def _add_amount(command: argparse.ArgumentParser) -> None:
     amount.add_argument("--quiet", "-q", action="store_true", help="print nothing but warnings and errors")
 
 
+def _show(options: argparse.Namespace, lines: Callable[[int], Iterable[Any]], details: Callable[[int], Any]) -> None:
+    """Print what a command says for the terminal's width: nothing, the answer, or with `--verbose` all details."""
+    from torchid.report.tables import terminal_width
+    from torchid.terminal.lines import show
+
+    if not options.quiet:
+        show((details if options.verbose else lines)(terminal_width()))
+
+
 def _identify(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.identify import identify
         from torchid.config import load_config
-        from torchid.terminal.identification import print_answer, print_details
+        from torchid.terminal.identification import answer_lines, detail_parts
 
     run = identify(load_config(options.file, options.overrides), options.resume)
-    if not options.quiet:
-        (print_details if options.verbose else print_answer)(run)
+    _show(options, partial(answer_lines, run), partial(detail_parts, run))
 
 
 def _demo(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.demo import EXPERIMENT, copy_examples, run_demo
-        from torchid.terminal.identification import print_answer, print_details
-        from torchid.terminal.lines import print_labelled
+        from torchid.terminal.identification import answer_lines, detail_parts
 
     if options.copy is not None:
         if options.overrides:
@@ -285,56 +293,48 @@ def _demo(options: argparse.Namespace) -> None:
         print(f"written to    {folder}; in the folder above it: torchid identify {folder.name}/{EXPERIMENT.name}")
         return
     run = run_demo(options.overrides, options.output)
-    shown = ("experiment", f"{EXPERIMENT}; to edit a copy: torchid demo --copy FOLDER")
-    if options.verbose:
-        print_details(run)
-        print_labelled(*shown)
-    elif not options.quiet:
-        print_answer(run, shown)
+    last = [("experiment", f"{EXPERIMENT}; to edit a copy: torchid demo --copy FOLDER")]
+    _show(options, partial(answer_lines, run, last=last), partial(detail_parts, run, last=last))
 
 
 def _compress(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.compress import compress
         from torchid.config import load_config
-        from torchid.terminal.identification import print_compression
+        from torchid.terminal.identification import compression_parts
 
     done = compress(load_config(options.file, options.overrides), options.output)
-    if not options.quiet:
-        print_compression(done, options.verbose)
+    _show(options, partial(compression_parts, done), partial(compression_parts, done, verbose=True))
 
 
 def _evaluate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.evaluate import evaluate
-        from torchid.terminal.identification import print_all_errors, print_evaluation
+        from torchid.terminal.identification import evaluation_lines, evaluation_parts
 
     evaluated = evaluate(options.run, options.log, options.device, True, options.output, options.overwrite)
-    if not options.quiet:
-        (print_all_errors if options.verbose else print_evaluation)(evaluated)
+    _show(options, partial(evaluation_lines, evaluated), partial(evaluation_parts, evaluated))
 
 
 def _replay(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.replay import parse_gains, replay
-        from torchid.terminal.simulations import print_replay
+        from torchid.terminal.simulations import replay_lines
 
     gains = parse_gains("--kp", options.kp), parse_gains("--kd", options.kd)
     found = replay(options.run, options.log, options.window, options.output, options.overwrite, *gains, options.samples)
-    if not options.quiet:
-        print_replay(found, options.verbose)
+    _show(options, partial(replay_lines, found), partial(replay_lines, found, verbose=True))
 
 
 def _sample(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.sample import parse_prior_error, sample
-        from torchid.terminal.identification import print_samples
+        from torchid.terminal.identification import sample_lines
 
     options.prior_error = parse_prior_error(options.prior_error)
     keys = ("run", "count", "format", "output", "prior_error", "seed", "overwrite")
     drawn = sample(*(getattr(options, key) for key in keys))
-    if not options.quiet:
-        print_samples(drawn, options.verbose)
+    _show(options, partial(sample_lines, drawn), partial(sample_lines, drawn, verbose=True))
 
 
 def _export(options: argparse.Namespace) -> None:
@@ -347,7 +347,7 @@ def _export(options: argparse.Namespace) -> None:
 
 def _report(options: argparse.Namespace) -> None:
     with importing():
-        from torchid.commands.report import report
+        from torchid.commands.run_folder import report
 
     print(f"written to    {report(options.run)}")
 
@@ -356,35 +356,35 @@ def _analyze(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.analyze import analyze
         from torchid.config import load_analysis
-        from torchid.terminal.analysis import print_analysis, print_analysis_tables
+        from torchid.terminal.analysis import analysis_lines, analysis_parts
 
     analysis = analyze(load_analysis(options.file, options.overrides))
-    if not options.quiet:
-        (print_analysis_tables if options.verbose else print_analysis)(analysis)
+    _show(options, partial(analysis_lines, analysis), partial(analysis_parts, analysis))
 
 
 def _check(options: argparse.Namespace) -> int:
     with importing():
         from torchid.commands.check import check_files, check_outputs, write_check_outputs
-        from torchid.terminal.analysis import print_all_findings, print_checks
+        from torchid.terminal.analysis import check_lines, finding_parts
 
     inputs = (options.file, options.urdf, options.topics, options.columns)
     check_outputs(options.json, options.figure, options.overwrite, inputs)
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
     checked = check_files(options.file, options.overrides, **robot, topics=options.topics, columns=options.columns)
     write_check_outputs(checked, options.json, options.figure)
-    if not options.quiet:
-        (print_all_findings if options.verbose else print_checks)(checked, (options.json, options.figure))
+    written = options.json, options.figure
+    _show(options, partial(check_lines, checked, written), partial(finding_parts, checked, written))
     return 0 if all(log.usable for log in checked) else 1
 
 
 def _init(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.init import init
-        from torchid.terminal.lines import print_labelled
+        from torchid.report.tables import terminal_width
+        from torchid.terminal.lines import labelled, show
 
     for label, text in init(options.urdf, options.log, options.output, options.total_mass).lines:
-        print_labelled(label, text)
+        show(labelled(label, text, terminal_width()))
 
 
 def _convert(options: argparse.Namespace) -> None:
@@ -399,9 +399,8 @@ def _simulate(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.simulate import simulate
         from torchid.config import load_simulation
-        from torchid.terminal.simulations import print_all_motions, print_simulation
+        from torchid.terminal.simulations import all_motion_lines, simulation_lines
 
     config = load_simulation(options.file, options.overrides)
     stabilities = simulate(config)
-    if not options.quiet:
-        (print_all_motions if options.verbose else print_simulation)(config, stabilities)
+    _show(options, partial(simulation_lines, config, stabilities), partial(all_motion_lines, config, stabilities))

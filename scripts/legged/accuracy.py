@@ -19,7 +19,7 @@ from legged.recording import Noise, record
 from legged.robots import ROBOTS, Legged, TrueRobot
 from legged.simulate import Exact, simulated
 from torchid.commands.identify import identify
-from torchid.commands.results import Identification
+from torchid.commands.run_folder import Identification
 from torchid.config import load_config
 from torchid.errors import TorchidError
 from torchid.logs import Log, write_log

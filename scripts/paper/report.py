@@ -10,6 +10,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
+from torch.utils.tensorboard import SummaryWriter
 
 from paper.fits import Series
 from paper.results import TRUE, Results, error_figures, examine_claims
@@ -19,7 +20,6 @@ from torchid.parameters import Array
 from torchid.problem.metrics import ROW_GROUPS, group_name
 from torchid.report.figure_style import IDENTIFIED_COLOR, NOISE_COLOR, NOMINAL_COLOR, STYLE, label_decades, save_figure
 from torchid.report.tables import table_text
-from torchid.report.tensorboard import write_comparison
 
 _COLORS = (NOMINAL_COLOR, IDENTIFIED_COLOR, "#009e73", "#cc79a7", "#e69f00", NOISE_COLOR)  # of Okabe and Ito
 
@@ -210,6 +210,32 @@ def write_study(folder: Path, results: Results, series: Series) -> None:
         name: "    " + table_text(table).replace("\n", "\n    ") for name, table in tables.items()
     }
     write_comparison(folder / "tensorboard", scalars, texts, drawn)
+
+
+def write_comparison(
+    folder: Path,
+    scalars: Mapping[tuple[str, str], Sequence[float]],
+    texts: Mapping[str, str],
+    figures: Mapping[str, Figure],
+) -> None:
+    """Write charts that compare runs.
+
+    Args:
+        folder: where the event files go, those of every run in a folder of its own.
+        scalars: values of steps 0, 1, ... by run and tag.
+        texts: Markdown by tag.
+        figures: by tag.
+    """
+    for run in dict.fromkeys(run for run, _ in scalars):
+        with SummaryWriter(str(folder / run)) as writer:
+            for (of, tag), values in scalars.items():
+                for step, value in enumerate(values if of == run else ()):
+                    writer.add_scalar(tag, value, step)
+    with SummaryWriter(str(folder)) as writer:
+        for tag, text in texts.items():
+            writer.add_text(tag, text)
+        for tag, figure in figures.items():
+            writer.add_figure(tag, figure, close=False)
 
 
 def study_tables(results: Results) -> dict[str, Table]:

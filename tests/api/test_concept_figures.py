@@ -10,7 +10,7 @@ from repository import DEMO, ROOT
 from script_calls import script
 
 import torchid
-from torchid.commands.results import Identification
+from torchid.commands.run_folder import Identification
 from torchid.parameters import COULOMB, PER_BODY, VISCOUS
 from torchid.report.figures import INTERVAL
 

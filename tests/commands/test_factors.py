@@ -13,7 +13,7 @@ from fleets import compressed, demo_fleet, fitted_twice, walks
 
 import torchid
 from torchid.cli import main
-from torchid.commands.results import Identification
+from torchid.commands.run_folder import Identification
 from torchid.config import load_config
 from torchid.fitting.factor_files import FactorFile, read_factors, write_factors
 from torchid.problem.metrics import WHITENED

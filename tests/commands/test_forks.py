@@ -118,7 +118,7 @@ def test_a_figure_that_cannot_be_drawn_is_said_in_one_line(
     def fails(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("torchid.commands.run_figures.error_figure", fails)
+    monkeypatch.setattr("torchid.commands.run_folder.error_figure", fails)
     monkeypatch.setattr(parallel, "_allowed", True)
     settings, output = str(place / "demo" / "quadruped.yaml"), tmp_path / "run"
     assert main(["identify", settings, "estimator.ridge=0.1", f"output={output}", "--quiet"]) == 1

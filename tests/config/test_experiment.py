@@ -14,7 +14,7 @@ from refusals import assert_unknown_key, assert_wrong_value
 from torchid.config import dump_config, load_config
 from torchid.config.estimator import EstimatorConfig
 from torchid.config.experiment import ActuatorsConfig
-from torchid.config.log_reading import PreprocessingConfig
+from torchid.config.logs import PreprocessingConfig
 from torchid.errors import ConfigError, InputError
 
 ALL: dict[str, Any] = {

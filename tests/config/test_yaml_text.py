@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from torchid.config import load_config
-from torchid.config.yaml_text import check_yaml, yaml_lines
+from torchid.config.settings_files import check_yaml, yaml_lines
 from torchid.errors import ConfigError
 
 HEAD = "robot: {urdf: x.urdf}\n"

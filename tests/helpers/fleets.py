@@ -15,7 +15,7 @@ from walking import MACHINES, recorded, truth
 
 from torchid.commands.compress import Compression, compress
 from torchid.commands.identify import identify
-from torchid.commands.results import Identification
+from torchid.commands.run_folder import Identification
 from torchid.config import load_config
 from torchid.logs import write_log
 

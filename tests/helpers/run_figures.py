@@ -26,7 +26,7 @@ PAGE, EVENTS = "write_page", "write_events"
 _WHITE = Figure(figsize=(1.0, 1.0))
 _figure_bytes = figure_style.figure_bytes
 _white_bytes = cache(partial(_figure_bytes, _WHITE))
-_MODULES = [import_module(f"torchid.commands.{name}") for name in ("results", "run_figures", "evaluate", "analyze")]
+_MODULES = [import_module(f"torchid.commands.{name}") for name in ("run_folder", "evaluate", "analyze")]
 _DRAWN = [
     (module, name, vars(module)[name])
     for module in _MODULES

@@ -12,7 +12,7 @@ from hostile import examined, judged
 from hostile_settings import BASE, damaged, documents, overrides, wrong_values
 
 from torchid.config import load_analysis, load_config
-from torchid.config.yaml_text import check_yaml
+from torchid.config.settings_files import check_yaml
 from torchid.errors import ConfigError
 from torchid.guards import MAX_DEPTH, MAX_NODES
 

@@ -30,7 +30,7 @@ from motions import value
 from synthetic import Array
 
 from torchid.cli import main
-from torchid.config.log_reading import load_topics
+from torchid.config.logs import load_topics
 from torchid.errors import ConfigError, LogError
 from torchid.logs import Log, read_log
 

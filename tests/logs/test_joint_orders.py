@@ -16,7 +16,7 @@ from synthetic import G1, ROBOTS
 
 from torchid.cli import main
 from torchid.config import load_config
-from torchid.config.log_reading import load_columns
+from torchid.config.logs import load_columns
 from torchid.logs import Columns, Log, read_log
 from torchid.logs.blocks import open_log_blocks
 from torchid.logs.unitree import JOINT_ORDERS

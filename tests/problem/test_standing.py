@@ -19,7 +19,7 @@ from synthetic import Array
 from walking import robot_of
 
 from torchid.config.experiment import AnalyzeConfig
-from torchid.config.log_reading import PreprocessingConfig
+from torchid.config.logs import PreprocessingConfig
 from torchid.config.robot import RobotConfig
 from torchid.errors import LogError, TorchidWarning, UnknownNameError
 from torchid.fitting.experiment import RobotSetup

@@ -17,7 +17,7 @@ from demo import shortened_demo
 
 from torchid.boundary import run_guarded
 from torchid.cli import main
-from torchid.commands.report import DATA, PAGE, _read, report
+from torchid.commands.run_folder import DATA, PAGE, _read, report
 from torchid.errors import InputError
 from torchid.report.page import FIGURES, page_text
 

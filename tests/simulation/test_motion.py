@@ -14,7 +14,7 @@ from torchid.config import FootConfig, MotionConfig, SimulationConfig
 from torchid.config.simulation import WaveConfig
 from torchid.errors import InputError, UnknownNameError
 from torchid.simulation import LEAD_S, Simulation, set_up_simulation
-from torchid.simulation.controller import Setpoint
+from torchid.simulation.simulation import Setpoint
 
 HZ = 500.0  # setpoints per second
 

@@ -14,7 +14,7 @@ from repository import DEMO
 
 from torchid.cli import _options, main
 from torchid.commands.identify import identify
-from torchid.commands.results import Identification
+from torchid.commands.run_folder import Identification
 from torchid.config import load_config
 from torchid.estimators import SgdEstimate
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED, ConstrainedEstimate

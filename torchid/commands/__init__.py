@@ -1,10 +1,10 @@
 """Commands, from arguments to files and folders, and the formats that they write.
 
 A module for each command: `analyze`, `check` (and `convert`), `compress`, `demo`, `evaluate`, `export`, `identify`,
-`init`, `replay`, `report`, `sample`, `simulate`. What they are made of:
+`init`, `replay`, `sample`, `simulate`. What they are made of:
 
 - a fit: `chosen_settings`, `training`, `plausibility`
-- what `identify` returns and says: `results`, `named_results`, `answer`, `run_figures`
+- what `identify` returns and says: `results`, `answer`, and `run_folder`, which makes its page anew too
 - parts of `init` and `analyze`: `init_logs`, `init_robot`, `sensor_set_accuracy`
 - folders: `folder`
 """

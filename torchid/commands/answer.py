@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from textwrap import shorten
 
 import numpy as np
 
+from torchid.commands.results import Results
 from torchid.config.logs import tests_on_seen_samples
-from torchid.errors import format_percent, join_names
+from torchid.errors import format_count, format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.least_squares import IDENTIFIED
 from torchid.fitting.calibration import Confounded, list_confounded
@@ -27,6 +28,7 @@ from torchid.problem.metrics import (
     LIMB_GROUPS,
     PRESSURE,
     compare_parts,
+    describe_errors,
     describe_worse,
     group_name,
 )
@@ -34,10 +36,8 @@ from torchid.report.tables import noise_advice
 from torchid.report.urdf_files import massless_ends
 from torchid.reprs import decimal
 
-if TYPE_CHECKING:
-    from torchid.commands.results import Identification
-
 _FEW_GROUPS, _FEW_NAMED = 2, 4
+_WIDTH = 108  # of a line of a summary
 _IN_PART = " in part"
 #: By the least and the largest error of a group of rows, as shares of the URDF's.
 _VERDICTS = {
@@ -135,7 +135,7 @@ class Answer:
     terms: str = ""
 
 
-def answer(run: Identification) -> Answer:
+def answer(run: Results) -> Answer:
     """The answer of a finished run."""
     judged = _judge(run)
     return Answer(
@@ -148,14 +148,39 @@ def answer(run: Identification) -> Answer:
     )
 
 
-def _total_mass(run: Identification) -> str:
+def summary_lines(run: Results) -> list[str]:
+    """What a run is and found, in at most ten lines."""
+    robot, estimate, config = run.experiment.robot, run.estimate, run.experiment.config
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in estimate.verdict_counts().items() if count)
+    said = [("data", f"{format_count(run.samples, 'sample')} of {format_count(len(config.logs.train), 'log')}")]
+    said += [("parameters", f"{estimate.phi.size}: {counts}")]
+    if not robot.fixed_base:
+        said.append(("total mass", f"{run.mass} ({robot.format}: {decimal(run.mass.nominal)} kg)"))
+    sets = {name: (pair.identified, pair.nominal) for name, pair in run.metrics.items()}
+    if run.validation is not None:
+        sets["left out"] = (run.validation.identified, run.validation.nominal)
+    for name, (identified, nominal) in sets.items():
+        texts = (describe_errors(group, identified.rms_of(group), nominal.rms_of(group)) for group in DECISIVE_GROUPS)
+        said.append((name, "; ".join(filter(None, texts))))
+    trouble = [
+        *([f"WORSE THAN {robot.format}: {describe_worse(run.worse, robot.format)}"] if run.worse else []),
+        str(run.misfit),
+    ]
+    said += [("attention", "; ".join(filter(None, trouble)))] if any(trouble) else []
+    said.append(("written to", str(config.output or "no folder: write(folder), to_urdf(file)")))
+    of = f"{robot.path.name}, {len(run)} bodies, {format_count(robot.n, 'joint')}, by {config.estimator.name}"
+    lines = (f"{label:12}{shorten(text, _WIDTH, placeholder=' ...')}" for label, text in said)
+    return [f"Identification of {of}", *lines]
+
+
+def _total_mass(run: Results) -> str:
     gain, of = run.experiment.config.sensors.gain_error, run.experiment.robot.format
     counted = run.mass.determined and run.estimate.gain_error is not None and run.estimate.gain_error.any()
     gains = f"; ± counts gain errors of {100.0 * gain:g} %" if counted else ""
     return f"{run.mass} ({of}: {decimal(run.mass.nominal)} kg{gains})"
 
 
-def _judge(run: Identification) -> ErrorComparison:
+def _judge(run: Results) -> ErrorComparison:
     of = run.experiment.robot.format
     if "test" in run.metrics:
         files = run.experiment.config.logs
@@ -171,14 +196,14 @@ def _judge(run: Identification) -> ErrorComparison:
     return ErrorComparison("the training logs themselves", nominal, identified, of, "train" in run.at_rest)
 
 
-def _headline(run: Identification, judged: ErrorComparison) -> str:
+def _headline(run: Results, judged: ErrorComparison) -> str:
     if run.worse:
         return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
     explained = not any((*_unlike_sensors(judged.identified), *_unlike_joints(run)))
     return judged.headline("" if explained else "these forces")
 
 
-def _bodies_text(run: Identification) -> str:
+def _bodies_text(run: Results) -> str:
     names, robot = [], run.experiment.robot
     for one in run.violations:
         if one.body is not None and robot.body_names[one.body] not in names:
@@ -196,7 +221,7 @@ def _bodies_text(run: Identification) -> str:
     return f"{which} cannot exist, and simulators refuse them{advice}"
 
 
-def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
+def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
     """What the user should look at: conditions with what they mean and what to do, the most urgent first."""
     mass, of, estimate = run.mass, run.experiment.robot.format, run.estimate
     terms = [one.term for one in run.violations if one.term is not None]
@@ -243,7 +268,7 @@ def _attention(run: Identification, judged: ErrorComparison) -> Iterator[str]:
     return (text for applies, text in rules if applies)
 
 
-def _confounded(run: Identification) -> Sequence[Confounded]:
+def _confounded(run: Results) -> Sequence[Confounded]:
     return list_confounded([x for x in run.extras if x.extra.what not in run.choices.adopted_terms])
 
 
@@ -255,7 +280,7 @@ def _unfinished(estimate: Estimate) -> Iterator[str]:
         yield f"not converged: {share} % above the optimum; {advice}"
 
 
-def _resting(run: Identification) -> Iterator[str]:
+def _resting(run: Results) -> Iterator[str]:
     """That joints rest where forces are not explained, or all the time where their torques count as unmeasured then."""
     if run.experiment.config.actuators.stiction:
         if still := [name for name, share in run.resting.items() if share == 1.0]:
@@ -291,7 +316,7 @@ def _computed(judged: ErrorComparison) -> Iterator[str]:
         yield f"the {judged.of} predicts these forces {to}: were they computed from it, or commanded, not measured?"
 
 
-def _heavy(run: Identification) -> Iterator[str]:
+def _heavy(run: Results) -> Iterator[str]:
     """Bodies beyond `_HEAVY` times their mass in the robot's file, which their own interval does not exclude."""
     robot, estimate = run.experiment.robot, run.estimate
     mass, error = (x.reshape(-1, PER_BODY)[:, 0] for x in (estimate.phi, estimate.standard_error))
@@ -304,7 +329,7 @@ def _heavy(run: Identification) -> Iterator[str]:
         yield f"{join_names(named, _FEW_NAMED)} the {robot.format}'s mass, {why}"
 
 
-def _driving(run: Identification) -> Iterator[str]:
+def _driving(run: Results) -> Iterator[str]:
     """That Coulomb friction is negative far beyond its standard errors, which least squares lets it be."""
     value, error = (x.reshape(-1, PER_BODY)[:, COULOMB] for x in (run.estimate.phi, run.estimate.standard_error))
     bodies = np.array(run.experiment.robot.bodies, object)[value < -_CLEAR_ERRORS * error]
@@ -313,7 +338,7 @@ def _driving(run: Identification) -> Iterator[str]:
         yield f"friction drives {names}: its torque is reversed, or its friction of another shape: torchid check"
 
 
-def _implicit(run: Identification) -> Iterator[str]:
+def _implicit(run: Results) -> Iterator[str]:
     """That armatures are those which a simulator's implicit integration of a PD law adds, where its kd is stated."""
     logs, robot = run.experiment.config.logs, run.experiment.robot
     torque = logs.columns.joint_torque if logs.columns else None
@@ -342,7 +367,7 @@ def implicit_step(kd: Mapping[str, float], armatures: Mapping[str, float], step:
     return common if alike and known else None
 
 
-def _unlike_joints(run: Identification) -> Iterator[str]:
+def _unlike_joints(run: Results) -> Iterator[str]:
     """That the fit leaves much of the torque of single joints of a bolted robot."""
     fitted = run.metrics["train"].identified
     if run.experiment.robot.fixed_base and (joints := unexplained_joints(fitted)):

@@ -13,8 +13,7 @@ import numpy as np
 
 from torchid.commands.folder import check_free_file
 from torchid.config import load_analysis
-from torchid.config.log_reading import PreprocessingConfig, load_columns, load_topics
-from torchid.config.logs import LogsConfig
+from torchid.config.logs import LogsConfig, PreprocessingConfig, load_columns, load_topics
 from torchid.config.robot import ContactConfig
 from torchid.errors import ConfigError, LogError, about_file, current_file, format_count
 from torchid.fitting.experiment import resolve_contacts, set_up_robot

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torchid.commands.folder import EXAMPLES, new_folder
 from torchid.commands.identify import identify
-from torchid.commands.results import Identification
+from torchid.commands.run_folder import Identification
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
 

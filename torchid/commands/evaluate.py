@@ -15,8 +15,7 @@ from rich.progress import Progress
 
 from torchid import distributed
 from torchid.commands.folder import EVALUATION, EVALUATIONS, check_free, new_folder, refuse_link, write_json
-from torchid.commands.results import Identification
-from torchid.commands.run_figures import force_figures
+from torchid.commands.run_folder import Identification, force_figures
 from torchid.config import load_config
 from torchid.config.robot import NoiseConfig
 from torchid.errors import ConfigError, about_file, during, warn

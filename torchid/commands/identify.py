@@ -17,7 +17,7 @@ from torchid.commands.chosen_settings import Choices, with_chosen_settings, with
 from torchid.commands.evaluate import compare_forces, trace_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible, suspected_mistake
-from torchid.commands.results import Identification, write_run
+from torchid.commands.run_folder import Identification, write_run
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import ConfigError, NumericalWarning, warn_about_file

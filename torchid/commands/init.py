@@ -28,9 +28,9 @@ from torchid.commands.init_robot import (
     without_rolling,
 )
 from torchid.config import load_config
-from torchid.config.log_reading import PreprocessingConfig
+from torchid.config.logs import PreprocessingConfig
 from torchid.config.robot import ContactConfig
-from torchid.config.yaml_text import inline_yaml, yaml_lines
+from torchid.config.settings_files import inline_yaml, yaml_lines
 from torchid.errors import (
     ConfigError,
     InputError,

@@ -13,7 +13,7 @@ from rich.progress import Progress, TaskID
 from torchid import parameters
 from torchid.commands.check import LogSegment, segments_to_check
 from torchid.commands.chosen_settings import is_near_nominal, lower_cutoff, needs_these_torques
-from torchid.commands.results import Identification
+from torchid.commands.run_folder import Identification
 from torchid.config import ExperimentConfig
 from torchid.config.logs import LogsConfig
 from torchid.errors import (

@@ -1,52 +1,245 @@
-"""What a finished identification holds, and the folder it is written to."""
+"""What an identification finds: its numbers, by the names of bodies and joints, and as rows of a table."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+from numpy.typing import NDArray
+from rich.table import Table
+from rich.text import Text
 
+from torchid import parameters
 from torchid.commands.chosen_settings import Choices
-from torchid.commands.folder import RUN, check_free, check_free_file, new_folder, write_json
-from torchid.commands.named_results import BodyEstimate, ParameterTable, body_estimate, parameter_table, run_lines
-from torchid.commands.report import DATA, report_document, write_page
-from torchid.commands.run_figures import draw_figures, write_events
-from torchid.commands.training import Training, body_eigenvalues
-from torchid.config import dump_config, inputs_of
-from torchid.errors import during
-from torchid.estimators import ConstrainedEstimate, Estimate, Violation
-from torchid.fitting.calibration import Comparison, list_confounded
+from torchid.errors import UnknownNameError
+from torchid.estimators import Estimate, Violation
+from torchid.fitting.calibration import Comparison
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.noise import Misfit, NoiseSummary
-from torchid.fitting.posterior import POSTERIOR, RESIDUAL, FittedPosterior, RigidPlusResidual, write_posterior
+from torchid.fitting.posterior import FittedPosterior
 from torchid.fitting.robust import RobustSummary
 from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
 from torchid.identifiability.information import Contributions
-from torchid.logs.containers import atomic_output
-from torchid.parameters import PER_BODY, Array
+from torchid.parameters import PARAMETER_UNITS, PARAMETERS, PER_BODY, Array
 from torchid.problem import Metrics
-from torchid.problem.extras import NoiseGroups
-from torchid.problem.metrics import LOG_SETS, WorseThanNominal, describe_worse, worse_than_nominal
+from torchid.problem.metrics import WorseThanNominal, worse_than_nominal
 from torchid.problem.noise_gram import NoiseShares
-from torchid.report import FittedJoints, identified_name, identified_robot, identified_urdf, parameters_document
+from torchid.report import FittedJoints
 from torchid.report.forces import ForceSeries, LogForces
 from torchid.report.robot_files import refused_by_simulators
+from torchid.report.tables import table_text
+from torchid.robot import Robot
 
 HELD_OUT = "blocks left out of the fit"
 """Name of the training samples that cross-validation predicts, in messages."""
+_FEW_ROWS = 8
+
+
+class _OfBody:
+    """Twelve values of a body, (12,), by the names of its parameters."""
+
+    _values: NDArray[Any]
+
+    def __getitem__(self, parameter: str) -> Any:
+        """The value of a parameter by its symbol, as in `parameters.json`: m, mcx, ..., Ixx, ..., fc, fv.
+
+        Raises:
+            UnknownNameError: there is no such parameter.
+        """
+        if parameter not in PARAMETERS:
+            raise UnknownNameError("", "parameter", str(parameter), PARAMETERS)
+        return self._values[PARAMETERS.index(parameter)].item()
+
+    def to_dict(self) -> dict[str, Any]:
+        return dict(zip(PARAMETERS, self._values.tolist(), strict=True))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BodyValues(_OfBody):
+    """Parameters of one body in its link frame, or their standard errors (NaN where the data determine none)."""
+
+    _values: Array
+
+    @property
+    def mass(self) -> float:
+        """[kg]."""
+        return float(self._values[parameters.MASS])
+
+    @property
+    def first_moment(self) -> Array:
+        """Mass times centre of mass, (3,) [kg m]."""
+        return self._values[parameters.FIRST_MOMENT].copy()
+
+    @property
+    def inertia(self) -> Array:
+        """Rotational inertia about the link frame's origin, (3, 3) [kg m^2]."""
+        return parameters.inertia_matrix(self._values)
+
+    @property
+    def coulomb_friction(self) -> float:
+        """Of the joint that moves the body, [N m], or [N] of a prismatic one."""
+        return float(self._values[parameters.COULOMB])
+
+    @property
+    def viscous_friction(self) -> float:
+        """Of the joint that moves the body, [N m s/rad], or [N s/m] of a prismatic one."""
+        return float(self._values[parameters.VISCOUS])
+
+    def __repr__(self) -> str:
+        return "\n".join(f"{name:4}{value: .6g} {unit}" for name, value, unit in self._lines())
+
+    def _lines(self) -> Iterator[tuple[str, float, str]]:
+        """Inertia in two lines would be read as a matrix; mass, moments and friction are what is looked for first."""
+        for name in ("m", "mcx", "mcy", "mcz", "Ixx", "Iyy", "Izz", "fc", "fv"):
+            yield name, self[name], PARAMETER_UNITS[PARAMETERS.index(name)]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BodyVerdicts(_OfBody):
+    """How far the data determine the parameters of one body, see `Estimate.verdict`."""
+
+    _values: NDArray[np.str_]
+
+    @property
+    def mass(self) -> str:
+        """Of the mass."""
+        return str(self._values[parameters.MASS])
+
+    @property
+    def first_moment(self) -> tuple[str, ...]:
+        """Of mass times centre of mass, three."""
+        return tuple(self._values[parameters.FIRST_MOMENT].tolist())
+
+    @property
+    def inertia(self) -> tuple[str, ...]:
+        """Of Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
+        return tuple(self._values[parameters.INERTIA].tolist())
+
+    @property
+    def coulomb_friction(self) -> str:
+        """Of Coulomb friction."""
+        return str(self._values[parameters.COULOMB])
+
+    @property
+    def viscous_friction(self) -> str:
+        """Of viscous friction."""
+        return str(self._values[parameters.VISCOUS])
+
+    def __repr__(self) -> str:
+        by_verdict: dict[str, list[str]] = {}
+        for name, verdict in self.to_dict().items():
+            by_verdict.setdefault(verdict, []).append(name)
+        return "\n".join(f"{verdict}: {', '.join(names)}" for verdict, names in by_verdict.items())
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BodyEstimate(BodyValues):
+    """Identified parameters of one body, with the URDF's, standard errors and verdicts under the same names.
+
+    Attributes:
+        name: of the body, that of its link.
+        joint: that moves it, "" for the base.
+        nominal: the URDF's parameters.
+        standard_error: of the identified ones, NaN where the data do not determine them.
+        verdict: how far the data determine them.
+    """
+
+    name: str = field(kw_only=True)
+    joint: str = field(kw_only=True)
+    nominal: BodyValues = field(kw_only=True)
+    standard_error: BodyValues = field(kw_only=True)
+    verdict: BodyVerdicts = field(kw_only=True)
+
+    @property
+    def center_of_mass(self) -> Array:
+        """In the link frame, (3,) [m]; NaN without mass."""
+        return self.first_moment / self.mass if self.mass else np.full(3, np.nan)
+
+    def __repr__(self) -> str:
+        moved = f", moved by {self.joint}" if self.joint else ""
+        lines = [f"{self.name}{moved}: identified (nominal) ± standard error, verdict"]
+        for name, value, unit in self._lines():
+            error = self.standard_error[name]
+            known = f" ± {error:.2g}" if np.isfinite(error) else ""
+            lines.append(f"{name:4}{value: .5g} ({self.nominal[name]:.5g}){known} {unit}, {self.verdict[name]}")
+        return "\n".join(lines)
+
+
+def body_estimate(robot: Robot, estimate: Estimate, name: str) -> BodyEstimate:
+    """What an estimate says of a body, by its name, or else by that of its joint or of any link of it.
+
+    Raises:
+        UnknownNameError: the robot has neither.
+    """
+    joints = {body.joint.name: number for number, body in enumerate(robot.bodies) if body.joint is not None}
+    numbers = {link: number for link, (number, _) in robot.links.items()} | joints
+    numbers |= {body: number for number, body in enumerate(robot.body_names)}
+    if name not in numbers:
+        raise UnknownNameError("", "body or joint", str(name), (*robot.body_names, *joints))
+    number = numbers[name]
+    phi, error, verdict = (
+        x.reshape(-1, PER_BODY)[number] for x in (estimate.phi, estimate.standard_error, estimate.verdict)
+    )
+    joint = robot.bodies[number].joint
+    return BodyEstimate(
+        phi,
+        name=robot.body_names[number],
+        joint="" if joint is None else joint.name,
+        nominal=BodyValues(robot.nominal[number]),
+        standard_error=BodyValues(error),
+        verdict=BodyVerdicts(verdict),
+    )
+
+
+class ParameterTable(list[dict[str, Any]]):
+    """Rows of a table, one for each parameter of each body: mappings with the same keys, as `pandas.DataFrame` takes.
+
+    `print` shows all of it.
+    """
+
+    def __str__(self) -> str:
+        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+        for key in self[0] if self else ():
+            table.add_column(key, no_wrap=True, justify="right" if isinstance(self[0][key], float) else "left")
+        for row in self:
+            table.add_row(*(Text(f"{x:.5g}" if isinstance(x, float) else str(x)) for x in row.values()))
+        return "\n".join(line.rstrip() for line in table_text(table, 200).splitlines())
+
+    def __repr__(self) -> str:
+        if len(self) <= _FEW_ROWS:
+            return str(self)
+        return f"{ParameterTable(self[:_FEW_ROWS])}\n... {len(self)} rows; print() shows all"
+
+
+def parameter_table(robot: Robot, estimate: Estimate) -> ParameterTable:
+    """All parameters with the URDF's, standard errors and verdicts."""
+    rows = ParameterTable()
+    for name in robot.body_names:
+        body = body_estimate(robot, estimate, name)
+        for parameter, unit in zip(PARAMETERS, PARAMETER_UNITS, strict=True):
+            rows.append(
+                {
+                    "body": name,
+                    "parameter": parameter,
+                    "unit": unit,
+                    "urdf": body.nominal[parameter],
+                    "identified": body[parameter],
+                    "standard_error": body.standard_error[parameter],
+                    "verdict": body.verdict[parameter],
+                }
+            )
+    return rows
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Identification:
-    """A finished run; `run["l_knee"]` is what it says of a body, by its name or that of its joint.
+class Results:
+    """What a run has found; `run["l_knee"]` is what it says of a body, by its name or that of its joint.
 
     Attributes:
         experiment: robot, contacts, sensors and settings, with the noise and the ridge that were used.
@@ -123,43 +316,9 @@ class Identification:
         """Number of bodies."""
         return len(self.experiment.robot.bodies)
 
-    def __repr__(self) -> str:
-        return "\n".join(run_lines(self))
-
     def table(self) -> ParameterTable:
         """All parameters of all bodies, one per row; `pandas.DataFrame` takes it."""
         return parameter_table(self.experiment.robot, self.estimate)
-
-    def to_dict(self) -> dict[str, Any]:
-        """What a run folder has in `parameters.json`, `metrics.json` and `config.yaml`."""
-        parameters = parameters_document(self.experiment.robot, self.estimate, self.by_state, self.extras)
-        config = yaml.safe_load(dump_config(self.experiment.config))
-        return {"parameters": parameters, "metrics": _metrics_document(self), "config": config}
-
-    def to_urdf(self, path: str | Path, overwrite: bool = False) -> Path:
-        """Write the URDF with the identified parameters; meshes keep their names.
-
-        Raises:
-            ConfigError: the file exists and `overwrite` is not set, or it is an input.
-
-        Warns:
-            TorchidWarning: bodies that cannot exist.
-        """
-        inputs = inputs_of(self.experiment.config)
-        check_free_file(path := Path(path), "path", overwrite, inputs, "overwrite=True")
-        with atomic_output(path) as new:
-            new.write_bytes(identified_urdf(self.experiment.robot, self.phi))
-        return path
-
-    def write(self, output: str | Path, overwrite: bool = False, learned: RigidPlusResidual | None = None) -> Path:
-        """Write the run folder that `torchid identify` writes, and what was learned beside, which `evaluate` takes up.
-
-        Raises:
-            ConfigError: the folder exists and may not be replaced.
-        """
-        check_free(path := Path(output).absolute(), overwrite, RUN, inputs_of(self.experiment.config))
-        write_run(self, path, overwrite, learned=learned)
-        return path
 
     def violations_by_name(self) -> list[dict[str, object]]:
         """Conditions that the identified parameters break, the body by its name."""
@@ -191,140 +350,3 @@ class Identification:
     def phi(self) -> Array:
         """Identified parameters, (L, 12)."""
         return self.estimate.phi.reshape(-1, PER_BODY)
-
-
-def write_run(
-    run: Identification,
-    output: Path,
-    overwrite: bool = False,
-    training: Training | None = None,
-    learned: RigidPlusResidual | None = None,
-) -> None:
-    """Write the run folder.
-
-    Args:
-        run: what to write.
-        output: the folder.
-        overwrite: whether a run that stands there may be replaced.
-        training: whose curves go into the folder, and whose checkpoint is then no longer needed.
-        learned: a module beside the rigid bodies, with its parameters of these.
-
-    Raises:
-        ConfigError: the folder exists and may not be replaced.
-    """
-    config, robot = replace(run.experiment.config, output=output), run.experiment.robot
-    run = replace(run, experiment=replace(run.experiment, config=config))
-    with during("writing", output), new_folder(output, overwrite) as folder:
-        (folder / "config.yaml").write_text(dump_config(config))
-        write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
-        write_json(folder / "metrics.json", _metrics_document(run))
-        if learned is not None:
-            learned.save(folder / RESIDUAL)
-        write_posterior(folder / POSTERIOR, run.posterior)
-        (folder / identified_name(robot)).write_bytes(identified_robot(robot, run.phi, run.fitted_joints))
-        write_json(folder / DATA, report_document(run))
-        if training is not None:
-            training.copy_curves(folder)
-        write_events(run, folder, draw_figures(run, folder))
-        write_page(folder, output)
-    if training is not None:
-        training.remove_checkpoint()
-
-
-def _metrics_document(run: Identification) -> dict[str, object]:
-    """What `metrics.json` holds: errors of the identified and of the nominal parameters."""
-    estimate, robot = run.estimate, run.experiment.robot
-    document: dict[str, object] = {}
-    for name in LOG_SETS:
-        pair = run.metrics.get(name)
-        document[name] = None if pair is None else pair.identified.as_dict()
-        document[f"{name}_nominal"] = None if pair is None else pair.nominal.as_dict()
-    variation = {name: pair.identified.base_force_of_variation for name, pair in run.metrics.items()}
-    return document | {
-        "noise_floor": {name: pair.identified.noise for name, pair in run.metrics.items()},
-        "base_force_rms_of_variation": variation,
-        "rank": estimate.rank,
-        "parameters": int(estimate.phi.size),
-        "condition_number": estimate.condition_number if estimate.rank else None,
-        "samples": run.samples,
-        "contacts": run.experiment.rolling,
-        "evaluated_samples": dict(run.evaluated),
-        "excluded_samples": run.excluded,
-        **({"factors": list(map(_factor_entry, run.factors))} if run.factors else {}),
-        "rows": estimate.rows,
-        "residual_std": estimate.residual_std,
-        "misfit": _misfit_document(run.misfit),
-        "resting_joints": dict(run.resting),
-        "at_rest": list(run.at_rest),
-        "motion_noise": asdict(run.motion_noise),
-        "nominal_error": None if run.posterior.nominal_error is None else asdict(run.posterior.nominal_error),
-        "total_mass": run.mass.value if run.mass.determined else None,
-        "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
-        "total_mass_separable_from_offsets": run.mass.separable,
-        "confounded": [asdict(one) | {"message": str(one)} for one in list_confounded(run.extras)],
-        "total_mass_nominal": float(robot.nominal[:, 0].sum()),
-        "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
-        "noise": {
-            "groups": [asdict(one) for one in run.noise.groups],
-            "used": NoiseGroups.of(robot).settings(run.noise.known),
-            "suggested": run.noise.suggested,
-        },
-        "robust": None if run.robust is None else asdict(run.robust),
-        "violations": run.violations_by_name(),
-        "solution": _solution_document(estimate),
-        "cross_validation": None
-        if run.validation is None
-        else {
-            "folds": run.validation.folds,
-            "nominal": run.validation.nominal.as_dict(),
-            "identified": run.validation.identified.as_dict(),
-        },
-        "ridge_selection": None if run.ridge is None else asdict(run.ridge),
-        **{f"{name}_selection": x and asdict(x) for name, x in vars(run.choices).items()},
-        "worse_than_nominal": [asdict(one) for one in run.worse],
-        "verdict": describe_worse(run.worse, robot.format),
-        "contact_states": run.state_entries(),
-        "identifiability": _identifiability_document(run),
-        "seconds": run.seconds,
-    }
-
-
-def _misfit_document(misfit: Misfit) -> dict[str, object]:
-    """What the fit leaves of the forces."""
-    return {
-        "explained": misfit.explained,
-        "message": str(misfit),
-        "expected_residual_std": misfit.expected,
-        "lack_of_fit": misfit.lack_of_fit,
-        "standard_error_growth": misfit.error_growth,
-        "unfitted_friction": None if misfit.friction is None else misfit.friction.ratio,
-    }
-
-
-def _factor_entry(factors: FactorFile) -> dict[str, object]:
-    """Which log a file of factors is of."""
-    log = factors.log
-    names = {"file": log.source, "log": factors.name, "sha256": factors.sha256, "torchid": factors.version}
-    return names | {"samples": log.samples, "duration_s": factors.duration}
-
-
-def _identifiability_document(run: Identification) -> dict[str, object]:
-    """What the data determine, and what each log and sensor adds; contact states have a list of their own."""
-    estimate, contributions = run.estimate, run.contributions
-    return {
-        "singular_values": estimate.singular_values.tolist(),
-        "condition_number": estimate.condition_number if estimate.rank else None,
-        "oversampling": estimate.oversampling,
-        **asdict(contributions.total),
-        "verdicts": estimate.verdict_counts(),
-        "logs": [asdict(log) for log in contributions.logs],
-        "sensors": [asdict(sensor) for sensor in contributions.sensors],
-    }
-
-
-def _solution_document(estimate: Estimate) -> dict[str, object] | None:
-    """What is known of the optimum, or of the descent."""
-    if not isinstance(estimate, ConstrainedEstimate):
-        return None
-    names = ["objective", "unconstrained", "distance", "gap", "steps", "active", "epochs", "best_epoch", "excess"]
-    return {name: getattr(estimate, name) for name in names if hasattr(estimate, name)}

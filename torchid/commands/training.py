@@ -32,7 +32,7 @@ from torchid.commands.folder import (
     refuse_link,
 )
 from torchid.config import ExperimentConfig, dump_config, inputs_of
-from torchid.config.yaml_text import check_yaml
+from torchid.config.settings_files import check_yaml
 from torchid.errors import ConfigError, InputError, SensorError, excerpt, warn
 from torchid.estimators import Conditions, Epoch, Estimate, Sgd, SgdEstimate, Trainer
 from torchid.estimators.least_squares import IDENTIFIED

@@ -12,8 +12,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorConfig, TaskWeightsConfig, validate_keys
-from torchid.config.log_reading import MAPS_ACCEPTED, PreprocessingConfig
-from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
+from torchid.config.logs import MAPS_ACCEPTED, SETS, LogsConfig, PreprocessingConfig, entries_spelled_out, resolve_logs
 from torchid.config.robot import (
     CHOICE_ACCEPTED,
     COMPONENTS_ACCEPTED,

@@ -1,4 +1,4 @@
-"""TensorBoard event files of a run (the only module that imports TensorBoard)."""
+"""TensorBoard event files of a run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import struct
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from matplotlib.figure import Figure
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
@@ -198,29 +197,3 @@ def _charts(tags: Sequence[str], groups: Iterable[str]) -> dict[str, list[str | 
 def _preformatted(text: str) -> str:
     """The text as a preformatted block of Markdown."""
     return "    " + text.replace("\n", "\n    ")
-
-
-def write_comparison(
-    folder: Path,
-    scalars: Mapping[tuple[str, str], Sequence[float]],
-    texts: Mapping[str, str],
-    figures: Mapping[str, Figure],
-) -> None:
-    """Write charts that compare runs.
-
-    Args:
-        folder: where the event files go, those of every run in a folder of its own.
-        scalars: values of steps 0, 1, ... by run and tag.
-        texts: Markdown by tag.
-        figures: by tag.
-    """
-    for run in dict.fromkeys(run for run, _ in scalars):
-        with SummaryWriter(str(folder / run)) as writer:
-            for (of, tag), values in scalars.items():
-                for step, value in enumerate(values if of == run else ()):
-                    writer.add_scalar(tag, value, step)
-    with SummaryWriter(str(folder)) as writer:
-        for tag, text in texts.items():
-            writer.add_text(tag, text)
-        for tag, figure in figures.items():
-            writer.add_figure(tag, figure, close=False)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
+from rich.table import Table
 
 from torchid.commands.analyze import Analysis, ScenarioAnalysis
 from torchid.errors import format_count, join_names
@@ -32,17 +33,11 @@ from torchid.report.analysis import (
     sets_table,
 )
 from torchid.report.log_checks import finding_table, group_alike, log_heading, skipped_checks_text
-from torchid.report.tables import print_tables, terminal_width
 from torchid.sensor_planning.observability import BaseObservability
-from torchid.terminal.lines import LABEL, LINES, labelled, print_labelled, print_rolling, rows_within, wrap_words
+from torchid.terminal.lines import LINES, labelled, rolling_lines, rows_within, wrap_words, written_line
 
 _MOST_ATTENTION, _TEXT_LINES = 2, 2
 _MOST_SCENARIOS = 4
-
-
-def print_analysis(analysis: Analysis) -> None:
-    """Print the answer for the terminal's width."""
-    print("\n".join(analysis_lines(analysis, terminal_width())))
 
 
 def analysis_lines(analysis: Analysis, width: int) -> list[str]:
@@ -54,31 +49,30 @@ def analysis_lines(analysis: Analysis, width: int) -> list[str]:
         lines += labelled("smallest set", _smallest_text(scenarios[0]), width, _TEXT_LINES + 1)
     else:
         lines += _scenario_lines(scenarios, width)
-    if analysis.setup.rolling:
-        lines += labelled("contacts", analysis.setup.rolling, width, 1)
+    lines += rolling_lines(analysis.setup.rolling, width, 1)
     attention = list(_attention(analysis, scenarios))
     for one in attention[:_MOST_ATTENTION]:
         lines += labelled("attention", one, width, _TEXT_LINES)
     if len(attention) > _MOST_ATTENTION:
         lines += labelled("", f"and {len(attention) - _MOST_ATTENTION} more: --verbose", width)
     lines += _accuracy_lines(analysis.accuracies, LINES - len(lines) - 1, width)
-    return [*lines, f"{'written to':{LABEL}}{analysis.output}"]
+    return [*lines, written_line(analysis.output)]
 
 
-def print_analysis_tables(analysis: Analysis) -> None:
-    """Print all tables of all scenarios."""
-    print_rolling(analysis.setup.rolling)
+def analysis_parts(analysis: Analysis, width: int) -> list[str | Table]:
+    """All tables of all scenarios."""
+    parts: list[str | Table] = [*rolling_lines(analysis.setup.rolling, width)]
     for scenario in analysis.scenarios:
-        _print_scenario(scenario)
+        parts += _scenario_parts(scenario, width)
     if analysis.resting is not None:
-        print_labelled("attention", resting_message(analysis.resting))
+        parts += labelled("attention", resting_message(analysis.resting), width)
     if analysis.accuracies:
-        print_tables(accuracy_table(analysis.accuracies))
+        parts.append(accuracy_table(analysis.accuracies))
         for message in confounded_messages(analysis.accuracies):
-            print_labelled("confounded", message)
+            parts += labelled("confounded", message, width)
     if analysis.without:
-        print_tables(left_out_table(analysis.without))
-    print(f"{'written to':{LABEL}}{analysis.output}")
+        parts.append(left_out_table(analysis.without))
+    return [*parts, written_line(analysis.output)]
 
 
 # --------------------------------------------------------------------------------------------------------- the answer
@@ -208,45 +202,43 @@ def _accuracy_lines(sets: Mapping[str, SetAccuracy], room: int, width: int) -> l
 # --------------------------------------------------------------------------------------------------------- all tables
 
 
-def _print_scenario(scenario: ScenarioAnalysis) -> None:
+def _scenario_parts(scenario: ScenarioAnalysis, width: int) -> list[str | Table]:
     plan, base = scenario.plan, scenario.base
-    print(f"Scenario {scenario.name}")
-    print_tables(branch_table(plan), *([sets_table(plan.parts)] if plan.parts else []))
+    parts: list[str | Table] = [f"Scenario {scenario.name}", branch_table(plan)]
+    parts += [sets_table(plan.parts)] if plan.parts else []
     proof = "no cheaper set exists" if plan.proven else "whether a cheaper set exists is not proven"
-    print_labelled("chosen", candidate_names(plan.chosen))
-    print_labelled("cost", f"{plan.cost:g}; {proof}")
+    parts += labelled("chosen", candidate_names(plan.chosen), width)
+    parts += labelled("cost", f"{plan.cost:g}; {proof}", width)
     named = {"Chosen sensors": plan.observability}
     if scenario.proposed is not None and scenario.proposed is not plan.observability:
         named["Proposed sensors"] = scenario.proposed
     for title, states in named.items():
-        if states:
-            print_tables(observability_table(title, states))
+        parts += [observability_table(title, states)] if states else []
         if title != "Chosen sensors" or plan.parts:
             for message in (*describe_losses(states), *describe_singular_postures(states)):
-                print_labelled("attention", message)
-    if plan.removals:
-        print_tables(removal_table(plan))
+                parts += labelled("attention", message, width)
+    parts += [removal_table(plan)] if plan.removals else []
     structure = f"{base.rank} combinations of {int(base.free.sum())} parameters"
-    print_labelled("structure", f"{structure}; base_parameters.txt names them")
-    print_labelled("determined", _determined_text(scenario))
-    print()
+    parts += labelled("structure", f"{structure}; base_parameters.txt names them", width)
+    return [*parts, *labelled("determined", _determined_text(scenario), width), ""]
 
 
 _NAMED = 2  # logs of a finding
 _FEWEST_ROWS = 4  # of the table of logs: empty line, heading, a log, how many others there are
 
 
-def print_checks(checked: Sequence[Checked], written: Sequence[str | None]) -> None:
-    """Print the answer for the terminal's width; `written`: files that have all of it, if any."""
-    print("\n".join(check_lines(checked, written, terminal_width())))
-
-
 def check_lines(checked: Sequence[Checked], written: Sequence[str | None], width: int) -> list[str]:
-    """The answer, in lines of at most so many columns, but for names that are longer; see `print_checks`."""
+    """The answer, in lines of at most so many columns, but for names that are longer.
+
+    Args:
+        checked: all logs.
+        written: files that have all of it, if any.
+        width: of the terminal.
+    """
     head = wrap_words(_verdict(checked), width)
-    rolling = labelled("contacts", checked[0].rolling, width, _TEXT_LINES) if checked and checked[0].rolling else []
+    rolling = rolling_lines(checked[0].rolling, width, _TEXT_LINES) if checked else []
     skipped = _skipped_lines(checked, _TEXT_LINES, width)
-    files = [f"{'written to':{LABEL}}{name}" for name in written if name]
+    files = [written_line(name) for name in written if name]
     room = LINES - len([*head, *rolling, *skipped, *files])
     table = _FEWEST_ROWS if len(checked) > 1 else 0
     found = _finding_lines(_alike(checked), room - table, width, len(checked))
@@ -255,21 +247,16 @@ def check_lines(checked: Sequence[Checked], written: Sequence[str | None], width
     return [*head, *found, *logs, *rolling, *skipped, *files]
 
 
-def print_all_findings(checked: Sequence[Checked], written: Sequence[str | None]) -> None:
-    """Print all findings about all logs with what to do, and what was not checked; see `print_checks`."""
-    if checked:
-        print_rolling(checked[0].rolling)
+def finding_parts(checked: Sequence[Checked], written: Sequence[str | None], width: int) -> list[str | Table]:
+    """All findings about all logs with what to do, and what was not checked; see `check_lines`."""
+    parts: list[str | Table] = [*rolling_lines(checked[0].rolling, width)] if checked else []
     for log in checked:
-        print(log_heading(log))
-        if log.findings:
-            print_tables(finding_table(log.findings))
+        parts.append(log_heading(log))
+        parts += [finding_table(log.findings)] if log.findings else []
         if skipped := skipped_checks_text(log):
-            print_labelled("not checked", skipped)
-        print_labelled("verdict", log.verdict)
-        print()
-    for name in written:
-        if name:
-            print(f"{'written to':{LABEL}}{name}")
+            parts += labelled("not checked", skipped, width)
+        parts += [*labelled("verdict", log.verdict, width), ""]
+    return [*parts, *(written_line(name) for name in written if name)]
 
 
 # --------------------------------------------------------------------------------------------------------- the answer

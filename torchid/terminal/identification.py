@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from textwrap import shorten
 
 import numpy as np
+from rich.table import Table
 
 from torchid.commands.answer import ErrorComparison, answer
 from torchid.commands.compress import CompressedFile, Compression
 from torchid.commands.evaluate import EvaluatedRun
-from torchid.commands.results import Identification
+from torchid.commands.run_folder import Identification
 from torchid.commands.sample import DrawnSamples
 from torchid.commands.training import body_eigenvalues
 from torchid.errors import format_count, join_names
 from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
-from torchid.fitting.cross_validation import CrossValidation
 from torchid.fitting.noise import Misfit
 from torchid.parameters import COULOMB, MASS, PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import (
@@ -35,9 +35,7 @@ from torchid.report.tables import (
     error_tables,
     extra_table,
     noise_advice,
-    print_tables,
     state_table,
-    terminal_width,
     verdict_counts_table,
     verdict_table,
     violation_table,
@@ -52,11 +50,11 @@ from torchid.terminal.lines import (
     column_lines,
     error_lines,
     labelled,
-    print_labelled,
-    print_noise,
-    print_rolling,
+    noise_parts,
+    rolling_lines,
     rows_within,
     wrap_words,
+    written_line,
 )
 
 _MOST_ATTENTION, _TEXT_LINES, _ATTENTION_LINES = 2, 2, 3
@@ -72,11 +70,6 @@ _MOST_DIGITS = 5  # behind the point
 _MARKS = {IDENTIFIED: " ", COMBINED: "+", PRIOR: "p", UNOBSERVABLE: ".", FIXED: "="}
 
 
-def print_answer(run: Identification, *last: tuple[str, str]) -> None:
-    """Print it for the terminal's width, with these words and what they are about at the end."""
-    print("\n".join(answer_lines(run, terminal_width(), last)))
-
-
 def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]] = ()) -> list[str]:
     """The answer, in lines that are not wider than so many columns.
 
@@ -90,13 +83,13 @@ def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]
     lines += labelled("total mass", said.total_mass, width, _TEXT_LINES)
     lines += labelled("bodies", said.bodies, width, _TEXT_LINES)
     lines += labelled("terms", said.terms, width, 1) if said.terms else []
-    lines += labelled("contacts", run.experiment.rolling, width, _TEXT_LINES) if run.experiment.rolling else []
+    lines += rolling_lines(run.experiment.rolling, width, _TEXT_LINES)
     for one, most in zip(said.attention, (_ATTENTION_LINES, *[_TEXT_LINES] * (_MOST_ATTENTION - 1)), strict=False):
         lines += labelled("attention", one, width, most)
     if len(said.attention) > _MOST_ATTENTION:
         lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
     output = run.experiment.config.output
-    end = [] if output is None else [f"{'written to':{LABEL}}{output}"]
+    end = [] if output is None else [written_line(output)]
     end += [line for one in last for line in labelled(*one, width, _TEXT_LINES)]
     if len(lines) + len(end) > LINES:
         lines = [line for line in lines if not line.startswith(group_name(PRESSURE))]
@@ -187,106 +180,93 @@ def _center_moved(nominal: Array, phi: Array, verdict: np.ndarray) -> str:
 _NAMED = 6  # conditions
 
 
-def print_details(run: Identification) -> None:
-    """Print the verdict, all that needs attention, all tables, and the key figures one per line."""
+def detail_parts(run: Identification, width: int, last: Sequence[tuple[str, str]] = ()) -> list[str | Table]:
+    """The verdict, all that needs attention, all tables, and the key figures one per line; as `answer_lines`."""
     estimate, robot, said = run.estimate, run.experiment.robot, answer(run)
-    print("\n".join(wrap_words(said.headline, terminal_width())))
-    for one in said.attention:
-        print_labelled("attention", one)
+    parts: list[str | Table] = [*wrap_words(said.headline, width)]
+    parts += [line for text in said.attention for line in labelled("attention", text, width)]
     if not run.misfit.explained:
-        _print_misfit(run.misfit)
-    print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics, robot.format))
+        parts += labelled("unexplained", _misfit_text(run.misfit), width)
+    parts += [state_table([asdict(state) for state in run.states]), *error_tables(run.metrics, robot.format)]
     if 0 < run.evaluated["train"] < run.samples:
         count = f"{run.evaluated['train']} of {run.samples} samples, evenly spaced"
-        print_labelled("train", f"errors of forces of {count}")
-    print_tables(
-        contribution_table(run.contributions),
-        verdict_table(robot.body_names, estimate.verdict),
-        verdict_counts_table(run.by_state, estimate),
-    )
-    print_noise(run.noise)
+        parts += labelled("train", f"errors of forces of {count}", width)
+    parts += [contribution_table(run.contributions), verdict_table(robot.body_names, estimate.verdict)]
+    parts += [verdict_counts_table(run.by_state, estimate), *noise_parts(run.noise, width)]
     if run.extras:
-        print_tables(extra_table(run.extras))
+        parts.append(extra_table(run.extras))
     if run.violations:
-        print_tables(violation_table(run.violations_by_name()))
+        parts.append(violation_table(run.violations_by_name()))
         if type(estimate) is Estimate:
-            print("estimator.name=consistent finds the best parameters that break none of them")
-    _print_fit(run)
-    timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
-    print_labelled("time", f"{run.samples} samples: {timed}")
-    print(f"written to    {run.experiment.config.output}")
+            parts.append("estimator.name=consistent finds the best parameters that break none of them")
+    parts += rolling_lines(run.experiment.rolling, width)
+    key_figures = (*_fit_texts(run), *_choice_texts({**run.choices.by_name(), "ridge": run.ridge}), *_end_texts(run))
+    parts += [line for label, text in key_figures for line in labelled(label, text, width)]
+    parts.append(written_line(run.experiment.config.output))
+    return [*parts, *(line for label, text in last for line in labelled(label, text, width))]
 
 
-def _print_misfit(misfit: Misfit) -> None:
+def _misfit_text(misfit: Misfit) -> str:
     growth = ""
     if misfit.error_growth is not None and misfit.error_growth > 1.0:
         growth = f"; standard errors are {misfit.error_growth:.2g} times (median) what noise alone would make of them"
-    print_labelled("unexplained", f"{misfit}{growth}")
+    return f"{misfit}{growth}"
 
 
-def _print_fit(run: Identification) -> None:
-    """Print the key figures, one per line."""
-    estimate, robot = run.estimate, run.experiment.robot
-    print_rolling(run.experiment.rolling)
-    sensors = run.experiment.sensors
+def _fit_texts(run: Identification) -> Iterator[tuple[str, str]]:
+    """Key figures of the fit, with what they are about."""
+    estimate, robot, sensors = run.estimate, run.experiment.robot, run.experiment.sensors
     weighted = "" if sensors.task_weights is None else ", weighted by estimator.task_weights"
-    print_labelled("minimized", minimized_errors(robot, run.experiment.contacts, sensors) + weighted)
-    print_labelled("parameters", f"{estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
-    print_labelled("condition", f"{estimate.condition_number:.3g}")
-    rest = "" if run.misfit.expected is None else f"; {run.misfit.expected:.3g} are left by noise alone"
-    print_labelled("residual", f"{estimate.residual_std:.3g} standard deviations of that noise{rest}")
+    yield "minimized", minimized_errors(robot, run.experiment.contacts, sensors) + weighted
+    yield "parameters", f"{estimate.rank} independent combinations of {int(estimate.phi.size)} identified"
+    yield "condition", f"{estimate.condition_number:.3g}"
+    noise_alone = "" if run.misfit.expected is None else f"; {run.misfit.expected:.3g} are left by noise alone"
+    yield "residual", f"{estimate.residual_std:.3g} standard deviations of that noise{noise_alone}"
     if run.motion_noise.combinations:
-        print_labelled("motion noise", str(run.motion_noise))
+        yield "motion noise", str(run.motion_noise)
     if run.validation is not None:
-        _print_validation(run.validation, run.experiment.robot.format)
-    _print_choices({**run.choices.by_name(), "ridge": run.ridge})
-    _print_conditions(run)
-    if isinstance(estimate, SgdEstimate):
-        print_labelled("training", f"{estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
-    print_labelled("total mass", f"{run.mass} ({robot.format}: {decimal(run.mass.nominal)} kg)")
-    if run.robust is not None:
-        kept = f"{100 * run.robust.mean_weight:.3g} % of the weight kept"
-        print_labelled("robust", f"{run.robust.loss}, {kept}, {run.robust.passes} passes")
-    if robot.massless:
-        print_labelled("left out", f"massless: {', '.join(robot.massless)}")
+        identified, nominal = run.validation.identified, run.validation.nominal
+        texts = (describe_errors(group, identified.rms_of(group), nominal.rms_of(group)) for group in DECISIVE_GROUPS)
+        blocks = f"each of {run.validation.folds} blocks, against {robot.format}"
+        yield "held out", f"{blocks}: {'; '.join(filter(None, texts))}"
 
 
-def _print_conditions(run: Identification) -> None:
-    """How the conditions of physical consistency are met, and what they cost."""
+def _choice_texts(choices: Mapping[str, object]) -> Iterator[tuple[str, str]]:
+    """Settings that were left to the logs, by name; None for what was stated."""
+    return ((name, str(choice)) for name, choice in choices.items() if choice is not None)
+
+
+def _end_texts(run: Identification) -> Iterator[tuple[str, str]]:
+    """How conditions of physical consistency are met and what they cost, the total mass, and the time of each step."""
     estimate, robot = run.estimate, run.experiment.robot
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
-    print_labelled("consistency", f"smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
+    yield "consistency", f"smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}"
     if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
-        print_labelled("objective", f"{100.0 * estimate.relative_increase:.3g} % above the least without conditions")
+        yield "objective", f"{100.0 * estimate.relative_increase:.3g} % above the least without conditions"
     if isinstance(estimate, ConsistentEstimate) and estimate.active:
-        print_labelled("at bounds", f"{len(estimate.active)}: {join_names(estimate.active, _NAMED)}")
+        yield "at bounds", f"{len(estimate.active)}: {join_names(estimate.active, _NAMED)}"
+    if isinstance(estimate, SgdEstimate):
+        yield "training", f"{estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}"
+    yield "total mass", f"{run.mass} ({robot.format}: {decimal(run.mass.nominal)} kg)"
+    if run.robust is not None:
+        kept = f"{100 * run.robust.mean_weight:.3g} % of the weight kept"
+        yield "robust", f"{run.robust.loss}, {kept}, {run.robust.passes} passes"
+    if robot.massless:
+        yield "left out", f"massless: {', '.join(robot.massless)}"
+    timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
+    yield "time", f"{run.samples} samples: {timed}"
 
 
-def _print_choices(choices: Mapping[str, object]) -> None:
-    """Settings that were left to the logs, by name; None for what was stated."""
-    for name, choice in choices.items():
-        if choice is not None:
-            print_labelled(name, str(choice))
-
-
-def _print_validation(validation: CrossValidation, nominal_of: str) -> None:
-    identified, nominal = validation.identified, validation.nominal
-    texts = (describe_errors(group, identified.rms_of(group), nominal.rms_of(group)) for group in DECISIVE_GROUPS)
-    text = f"each of {validation.folds} blocks, against {nominal_of}: {'; '.join(filter(None, texts))}"
-    print_labelled("held out", text)
-
-
-def print_compression(done: Compression, verbose: bool = False) -> None:
-    """Print the answer for the terminal's width; `verbose`: all tables before it, and every file."""
+def compression_parts(done: Compression, width: int, verbose: bool = False) -> list[str | Table]:
+    """The answer; `verbose`: all tables before it, and every file."""
+    parts: list[str | Table] = []
     if verbose:
-        print_tables(state_table([asdict(state) for state in done.states]))
-        print_noise(done.noise)
-    print("\n".join(compression_lines(done.files, terminal_width(), None if verbose else LINES)))
-    print_rolling(done.rolling)
-    _print_choices(done.choices.by_name())
+        parts += [state_table([asdict(state) for state in done.states]), *noise_parts(done.noise, width)]
+    parts += [*compression_lines(done.files, width, None if verbose else LINES), *rolling_lines(done.rolling, width)]
+    texts = [*_choice_texts(done.choices.by_name())]
     if not verbose and done.noise.suggested:
-        print_labelled("noise", noise_advice(done.noise.suggested))
-    print(f"{'written to':{LABEL}}{done.output}")
+        texts.append(("noise", noise_advice(done.noise.suggested)))
+    return [*parts, *(line for text in texts for line in labelled(*text, width)), written_line(done.output)]
 
 
 def compression_lines(files: Sequence[CompressedFile], width: int, most: int | None = None) -> list[str]:
@@ -306,11 +286,6 @@ def compression_lines(files: Sequence[CompressedFile], width: int, most: int | N
 
 MOST_LOGS = 8
 """Logs of which a sentence is printed each: two lines at 80 columns, within a screen."""
-
-
-def print_evaluation(evaluated: EvaluatedRun) -> None:
-    """Print the answer for the terminal's width."""
-    print("\n".join(evaluation_lines(evaluated, terminal_width())))
 
 
 def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
@@ -342,13 +317,13 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
     left_out = sum(evaluated.excluded.values())
     if left_out:
         lines.append(f"{'left out':{LABEL}}{left_out} samples that torchid check rejects")
-    return [*lines, f"{'written to':{LABEL}}{evaluated.output}"]
+    return [*lines, written_line(evaluated.output)]
 
 
-def print_all_errors(evaluated: EvaluatedRun) -> None:
-    """Print the errors of all logs by group of rows."""
-    print_tables(*error_tables(evaluated.metrics, evaluated.robot.format))
-    print(f"{'written to':{LABEL}}{evaluated.output}")
+def evaluation_parts(evaluated: EvaluatedRun, width: int) -> list[str | Table]:
+    """The errors of all logs by group of rows."""
+    del width
+    return [*error_tables(evaluated.metrics, evaluated.robot.format), written_line(evaluated.output)]
 
 
 def _sentence(one: ErrorComparison, explained: bool) -> str:
@@ -365,11 +340,6 @@ def _worst(one: ErrorComparison) -> float:
 _ENDS = (0.025, 0.5, 0.975)
 _FEWEST_FOR_TAILS = 40  # draws of which one is beyond each end of a 95 % range
 _MOST_PARAMETERS = 5  # bodies and joints in the answer
-
-
-def print_samples(drawn: DrawnSamples, verbose: bool = False) -> None:
-    """Print the answer for the terminal's width; `verbose`: with all parameters."""
-    print("\n".join(sample_lines(drawn, terminal_width(), verbose)))
 
 
 def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list[str]:
@@ -394,7 +364,7 @@ def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list
     columns = [(title, [f"{x:.4g}" for x in row]) for title, row in zip(titles, ranges, strict=True)]
     lines += column_lines(("widest, in SI units" if not verbose else "parameter", names), columns, width)
     where = "no file: --output samples.npz, ranges.json or, with --format urdf, a folder"
-    return [*lines, f"{'written to':{LABEL}}{where if drawn.output is None else drawn.output}"]
+    return [*lines, written_line(where if drawn.output is None else drawn.output)]
 
 
 def _shown(drawn: DrawnSamples, table: Array, verbose: bool) -> list[int]:

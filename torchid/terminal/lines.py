@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Iterable, Sequence
 from textwrap import wrap
 from typing import Any
 
@@ -12,7 +11,7 @@ from rich.text import Text
 
 from torchid.errors import one_line
 from torchid.fitting.noise import NoiseSummary
-from torchid.report.tables import noise_advice, noise_table, print_tables, table_text, terminal_width
+from torchid.report.tables import noise_advice, noise_table, print_tables, table_text
 
 LABEL = 14
 """Columns of the words before what they are about."""
@@ -53,11 +52,6 @@ def labelled(label: str, text: str, width: int, most: int | None = None) -> list
     """What a word is about, in at most so many lines below each other; see `wrap_words`."""
     lines = wrap_words(text, width - LABEL, most=most)
     return [f"{name:{LABEL}}{line}" for name, line in zip((label, *[""] * len(lines)), lines, strict=False)]
-
-
-def print_labelled(label: str, text: str) -> None:
-    """Print what a word is about, broken into lines below each other."""
-    print("\n".join(labelled(label, text, terminal_width())))
 
 
 def column_lines(
@@ -116,14 +110,26 @@ def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width:
     return column_lines(("rms error of", [group for group, *_ in errors]), columns, width) if errors else []
 
 
-def print_rolling(rolling: str) -> None:
-    """Print which feet roll on what, and from where that is known."""
-    if rolling:
-        print_labelled("contacts", rolling)
+def rolling_lines(rolling: str, width: int, most: int | None = None) -> list[str]:
+    """Which feet roll on what, and from where that is known, in at most so many lines; none where none rolls."""
+    return labelled("contacts", rolling, width, most) if rolling else []
 
 
-def print_noise(noise: NoiseSummary) -> None:
-    """Print the noise that rows were weighted with, and what should be stated where residuals contradict it."""
-    print_tables(noise_table([asdict(group) for group in noise.groups]))
-    if noise.suggested:
-        print_labelled("noise", noise_advice(noise.suggested))
+def written_line(output: object) -> str:
+    """Where results have been written."""
+    return f"{'written to':{LABEL}}{output}"
+
+
+def noise_parts(noise: NoiseSummary, width: int) -> list[str | Table]:
+    """The noise that rows were weighted with, and what should be stated where residuals contradict it."""
+    advice = labelled("noise", noise_advice(noise.suggested), width) if noise.suggested else []
+    return [noise_table(noise.groups), *advice]
+
+
+def show(parts: Iterable[str | Table]) -> None:
+    """Print lines, and tables as wide as `terminal_width` says."""
+    for part in parts:
+        if isinstance(part, Table):
+            print_tables(part)
+        else:
+            print(part)

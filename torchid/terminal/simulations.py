@@ -6,23 +6,16 @@ Apart from `terminal/identification.py`, whose commands need no MuJoCo.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Collection, Mapping
 
 from torchid.commands.replay import Replay
 from torchid.commands.simulate import nominal_name, simulated_balls
 from torchid.config import SimulationConfig
 from torchid.errors import format_count, format_percent
-from torchid.report.tables import print_tables, stability_table, terminal_width
 from torchid.simulation import Stability
-from torchid.terminal.lines import LABEL, LINES, column_lines, labelled, print_rolling, rows_within, wrap_words
+from torchid.terminal.lines import LINES, column_lines, labelled, rolling_lines, rows_within, wrap_words, written_line
 
 _TEXT_LINES = 2
-
-
-def print_simulation(config: SimulationConfig, stabilities: Mapping[str, Stability]) -> None:
-    """Print the answer for the terminal's width."""
-    print("\n".join(simulation_lines(config, stabilities, terminal_width())))
 
 
 def simulation_lines(config: SimulationConfig, stabilities: Mapping[str, Stability], width: int) -> list[str]:
@@ -38,25 +31,24 @@ def simulation_lines(config: SimulationConfig, stabilities: Mapping[str, Stabili
     nominal, kind = nominal_name(config), "URDF" if config.robot.mjcf is None else "MJCF"
     text = f"logs/ and {nominal}; the truth: exact/ and the simulated {kind}"
     end += labelled("to identify", text, width, _TEXT_LINES)
-    end.append(f"{'written to':{LABEL}}{config.output}")
+    end.append(written_line(config.output))
     room = LINES - len(lines) - len(end)
     return [*lines, *_motion_lines(config, stabilities, room, width), *end]
 
 
-def print_all_motions(config: SimulationConfig, stabilities: Mapping[str, Stability]) -> None:
-    """Print how the robot stood in every motion."""
-    print_rolling(simulated_balls(config))
-    print_tables(stability_table({name: asdict(stability) for name, stability in stabilities.items()}))
-    print(f"{'written to':{LABEL}}{config.output}")
+def all_motion_lines(config: SimulationConfig, stabilities: Mapping[str, Stability], width: int) -> list[str]:
+    """How the robot stood in every motion."""
+    table = column_lines(("motion", list(stabilities)), _columns(stabilities.values()), width)
+    return [*rolling_lines(simulated_balls(config), width), *table, written_line(config.output)]
 
 
 def _headline(config: SimulationConfig, stabilities: Mapping[str, Stability]) -> str:
     seconds = sum(motion.duration_s for motion in config.motions)
     motions = format_count(len(stabilities), "motion")
-    found = stabilities.values()
-    slip, margin = 1e3 * max(one.slip for one in found), 1e3 * min(one.zmp_margin for one in found)
+    slip = 1e3 * max(x.slip for x in stabilities.values())
+    margin = 1e3 * min(x.zmp_margin for x in stabilities.values())
     bounds = f"feet slip by at most {slip:.1f} mm, the zero-moment point stays {margin:.0f} mm inside the support"
-    effort = max(one.effort for one in found)
+    effort = max(x.effort for x in stabilities.values())
     limits = f", torques reach {100 * effort:.0f} % of their limits" if effort else ""
     return f"The robot stands throughout {motions}, {seconds:.4g} s: {bounds}{limits}"
 
@@ -64,31 +56,30 @@ def _headline(config: SimulationConfig, stabilities: Mapping[str, Stability]) ->
 def _motion_lines(config: SimulationConfig, stabilities: Mapping[str, Stability], room: int, width: int) -> list[str]:
     """A table of the motions, the nearest to a bound first, in at most so many lines."""
 
-    def use(one: Stability) -> float:
+    def use(stability: Stability) -> float:
         """The largest share of a bound that is used up."""
-        bounds, margin = config.bounds, one.zmp_margin
+        bounds, margin = config.bounds, stability.zmp_margin
         near = bounds.zmp_m / margin if margin > 0.0 else 1.0
-        return max(one.slip / bounds.slip_m, one.height_change / bounds.height_m, one.effort, near)
+        return max(stability.slip / bounds.slip_m, stability.height_change / bounds.height_m, stability.effort, near)
 
     order = sorted(stabilities, key=lambda name: use(stabilities[name]), reverse=True)
-    found = [stabilities[name] for name in order]
-    columns = [
-        ("slip [mm]", [f"{1e3 * one.slip:.1f}" for one in found]),
-        ("ZMP inside by [mm]", [f"{1e3 * one.zmp_margin:.0f}" for one in found]),
-        ("effort [%]", [f"{100 * one.effort:.0f}" if one.effort else "" for one in found]),
-        ("base height [m]", ["{:.3f} to {:.3f}".format(*one.base_height) for one in found]),
-        ("feet up [%]", [", ".join(f"{100 * share:.0f}" for share in one.unloaded) for one in found]),
-    ]
+    columns = _columns([stabilities[name] for name in order])
     return rows_within(("motion", order), columns, width, room, "motions farther from the bounds: --verbose")
+
+
+def _columns(stabilities: Collection[Stability]) -> list[tuple[str, list[str]]]:
+    """Headings and cells, the most important first."""
+    return [
+        ("slip [mm]", [f"{1e3 * x.slip:.1f}" for x in stabilities]),
+        ("ZMP inside by [mm]", [f"{1e3 * x.zmp_margin:.0f}" for x in stabilities]),
+        ("effort [%]", [f"{100 * x.effort:.0f}" if x.effort else "" for x in stabilities]),
+        ("base height [m]", ["{:.3f} to {:.3f}".format(*x.base_height) for x in stabilities]),
+        ("feet up [%]", [", ".join(f"{100 * share:.0f}" for share in x.unloaded) for x in stabilities]),
+    ]
 
 
 _MOST = 6  # joints in the answer
 _SHARES = (0.2, 0.4, 1.0)  # of a window
-
-
-def print_replay(replayed: Replay, verbose: bool = False) -> None:
-    """Print the answer for the terminal's width; `verbose`: with all joints."""
-    print("\n".join(replay_lines(replayed, terminal_width(), verbose)))
 
 
 def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[str]:
@@ -118,7 +109,7 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
     room = len(joints) + 1 if verbose else _MOST + 2
     lines += ["", *rows_within(headings, cells, width, room, "joints drifting less: --verbose")]
     if replayed.output is not None:
-        lines.append(f"{'written to':{LABEL}}{replayed.output}")
+        lines.append(written_line(replayed.output))
     return lines
 
 

@@ -212,7 +212,7 @@ def test_an_interrupt_while_results_are_written_loses_nothing_of_the_training(
         signal.raise_signal(signal.SIGINT)
 
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr("torchid.commands.results.write_json", stopped)
+        monkeypatch.setattr("torchid.commands.run_folder.write_json", stopped)
         assert main(command(experiment, output, "--resume")) == 1
     assert names_in(output.parent) == ["run.training"]
     assert load_checkpoint(training_of(output))["trainer"]["epoch"] == EPOCHS
