@@ -134,8 +134,11 @@ class _Warnings:
     """Prints warnings as lines: of libraries once, and if `fold` alike ones once, and none that the answer repeats."""
 
     def __init__(self, program: str, debug: bool, fold: bool) -> None:
-        self._program, self._debug, self._fold = program, debug, fold
-        self._printed, self._folded = set[str](), 0
+        self._program = program
+        self._debug = debug
+        self._fold = fold
+        self._printed = set[str]()
+        self._folded = 0
 
     def __call__(self, message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
         text = kind = f"{category.__name__}: {message}"
@@ -205,7 +208,9 @@ def _libraries_silent(debug: bool) -> Iterator[None]:
 
     What fails in the thread that writes event files is raised where they are written to.
     """
-    handler, root, hook = logging.NullHandler(), logging.getLogger(), threading.excepthook
+    handler = logging.NullHandler()
+    root = logging.getLogger()
+    hook = threading.excepthook
     if not debug:
         root.addHandler(handler)  # without a handler, Python writes warnings to standard error
         threading.excepthook = _ignore

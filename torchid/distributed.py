@@ -30,7 +30,9 @@ _LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # torchrun set
 #: For one exchange: processes wait for the slowest. Failures are told, and the death of a process ends its connections.
 _PATIENCE = timedelta(days=1)
 _POLL = 0.01  # [s]
-_FAILED, _END, _STATUS = "failed", "end", "status"
+_FAILED = "failed"
+_END = "end"
+_STATUS = "status"
 
 
 class LostProcessError(TorchidError):
@@ -49,7 +51,9 @@ class _Group:
     """The processes of a group; `failed` once one has told of an error, `lost` once one has gone."""
 
     def __init__(self, group: ProcessGroup | None, rank: int, size: int) -> None:
-        self.group, self.rank, self.size = group, rank, size
+        self.group = group
+        self.rank = rank
+        self.size = size
         self.failed = self.lost = False
 
     def exchange(self, about: str, value: object) -> list[Any]:
@@ -167,8 +171,10 @@ def own_share(sizes: Sequence[int]) -> slice:
 
     Successive, as pieces of one log and contact state reduce to one result.
     """
-    number, count = rank(), world_size()
-    total, ends = max(sum(sizes), 1), list(accumulate(sizes))
+    number = rank()
+    count = world_size()
+    total = max(sum(sizes), 1)
+    ends = list(accumulate(sizes))
     owners = [min(int(count * (end - size / 2) / total), count - 1) for size, end in zip(sizes, ends, strict=True)]
     return slice(owners.index(number), len(owners) - owners[::-1].index(number)) if number in owners else slice(0)
 
@@ -177,7 +183,8 @@ def own_share(sizes: Sequence[int]) -> slice:
 def apart() -> Iterator[None]:
     """Share nothing within the block, in which processes do different things."""
     global _sharing
-    together, _sharing = _sharing, _ALONE
+    together = _sharing
+    _sharing = _ALONE
     try:
         yield
     finally:
@@ -252,8 +259,8 @@ def join_launched() -> bool:
 
     try:
         store, rank, size = next(rendezvous("env://", timeout=_PATIENCE))
-        own = dist.PrefixStore(_name_of_attempt(store, rank, size), store)  # type: ignore[attr-defined]
-        dist.init_process_group("gloo", store=own, rank=rank, world_size=size, timeout=_PATIENCE)
+        attempt_store = dist.PrefixStore(_name_of_attempt(store, rank, size), store)  # type: ignore[attr-defined]
+        dist.init_process_group("gloo", store=attempt_store, rank=rank, world_size=size, timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
         raise ConnectionFailedError(f"the processes of this run do not reach each other ({error})") from error
     _launched = _Group(dist.group.WORLD, rank, size)
@@ -266,7 +273,8 @@ def _name_of_attempt(store: Any, rank: int, size: int) -> str:
     torchrun starts processes again beside the store of the attempt before (torch 2.13), where they would wait at the
     addresses of dead ones. What others have left is told from what they write now by answers to names just drawn.
     """
-    drawn, place = secrets.token_hex(8), "torchid/{}".format
+    drawn = secrets.token_hex(8)
+    place = "torchid/{}".format
     if rank:
         store.set(place(rank), drawn)
         name: str = store.get(place(drawn)).decode()  # waits for it

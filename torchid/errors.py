@@ -28,7 +28,10 @@ class InputError(TorchidError, ValueError):
     """
 
     def __init__(self, source: object, field: str, found: str, accepted: str) -> None:
-        self.source, self.field, self.found, self.accepted = str(source), field, found, accepted
+        self.source = str(source)
+        self.field = field
+        self.found = found
+        self.accepted = accepted
         super().__init__(one_line(_prefixed(source, f"{field}: {found}; accepted: {accepted}")))
 
     @classmethod
@@ -66,7 +69,9 @@ class UnknownNameError(InputError, KeyError):
 
     def __init__(self, source: object, field: str, name: str, valid: Iterable[str], what: str = "") -> None:
         """Take the name and the valid ones; `what` describes a name that is known, but not valid here."""
-        self.name, self.valid, self.what = name, tuple(valid), what
+        self.name = name
+        self.valid = tuple(valid)
+        self.what = what
         found = f"'{name}', {what}" if what else f"unknown name '{excerpt(name)}'"
         super().__init__(source, field, found, _nearest_names(name, self.valid))
 
@@ -106,9 +111,11 @@ class NumericalWarning(TorchidWarning):
 
 def warn(message: str, category: type[TorchidWarning] = TorchidWarning) -> None:
     """Warn, as of the line outside of torchid that led here: that is the line that a user can change."""
-    frame, level = inspect.currentframe(), 1
+    frame = inspect.currentframe()
+    level = 1
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == __package__:
-        frame, level = frame.f_back, level + 1
+        frame = frame.f_back
+        level = level + 1
     warnings.warn(message, category, stacklevel=level)
 
 

@@ -27,18 +27,22 @@ MAX_LETTERS = 200
 #: Unpacked bytes that are allowed for any file, and their ratio to the file's size: measured motion is compressed to
 #: half, values of 12 bits to a fifth, and only constants to less than a tenth. `check` reads 12 MB/s and needs five
 #: times their memory. Above `LARGE` bytes, files may contain more constants.
-MAX_SMALL, MAX_GROWTH = 64 * MEBIBYTE, 12
-LARGE, MAX_GROWTH_LARGE = 10_000_000, 100
+MAX_SMALL = 64 * MEBIBYTE
+MAX_GROWTH = 12
+LARGE = 10_000_000
+MAX_GROWTH_LARGE = 100
 #: Bytes of all arrays of a log that is read whole: 16 GiB are 2e7 samples of a 30-joint robot with three channels per
 #: joint.
 MAX_ARRAYS = 2**34
 #: Arrays in a file, and names in an array: a log has 22 fields, robots have less than a thousand joints.
-MAX_FIELDS, MAX_NAMES = 200, 10_000
+MAX_FIELDS = 200
+MAX_NAMES = 10_000
 #: Datasets and groups of an HDF5 file, where each episode has a group of the same ones: listing one takes 0.1 ms.
 MAX_DATASETS = 20_000
 #: Columns of a table: a humanoid with every sensor has about 500. Entries of the lists of a schema: the schema is read
 #: before its columns are counted, and also lists groups of rows.
-MAX_COLUMNS, MAX_SCHEMA = 20_000, 2**16
+MAX_COLUMNS = 20_000
+MAX_SCHEMA = 2**16
 #: Numbers in each list of a column of lists, which are columns then.
 MAX_LIST = 1000
 
@@ -50,7 +54,10 @@ MAX_DESCRIPTION = 8 * MEBIBYTE
 # --------------------------------------------------------------------------------------------------------- settings
 
 #: Bytes of a settings file, nesting, entries with aliases unfolded, and characters of one entry.
-MAX_YAML, MAX_DEPTH, MAX_NODES, MAX_TEXT = MEBIBYTE, 30, 5000, 5000
+MAX_YAML = MEBIBYTE
+MAX_DEPTH = 30
+MAX_NODES = 5000
+MAX_TEXT = 5000
 #: Bytes of a `parameters.json`: the largest robot in ten contact states has 10 MB. Empty lists take 12 times their text
 #: in memory.
 MAX_JSON = 32 * MEBIBYTE
@@ -59,13 +66,16 @@ MAX_JSON = 32 * MEBIBYTE
 
 #: Bytes and links of a URDF: the largest of the tested robots has 0.2 MB and 130 links. pytorch-kinematics takes 2 s
 #: for a chain of 300 joints and overflows its stack at 800.
-MAX_URDF, MAX_LINKS = 8 * MEBIBYTE, 300
+MAX_URDF = 8 * MEBIBYTE
+MAX_LINKS = 300
 #: Size of a number in a URDF, in any unit: products stay within the range of float64. Slides that must not move have a
 #: damping of 1e11 in published models.
 MAX_NUMBER = 1e12
 #: Shapes of a link, each with axes that are tried on all others; points of all shapes of a robot, counted per use of a
 #: mesh (one of 29 MB has 1.7 million vertices, a hundredth of them on its hull); and rotations of points, 30 ns each.
-MAX_SHAPES, MAX_POINTS, MAX_AXES = 300, 10_000_000, 50_000_000
+MAX_SHAPES = 300
+MAX_POINTS = 10_000_000
+MAX_AXES = 50_000_000
 
 
 def check_regular(path: Path) -> None:
@@ -108,9 +118,9 @@ def check_unpacked_size(path: Path, total: int, copy: Path | None = None) -> Non
     """Raise LogError where a file, or its copy, declares arrays of `total` bytes, far more than its size allows."""
     size = (copy or path).stat().st_size
     if total > max_unpacked_bytes(size):
-        found = f"arrays of {total} bytes in a file of {size}"
+        reason = f"arrays of {total} bytes in a file of {size}"
         accepted = f"at most {max_unpacked_bytes(size)} bytes in a file of this size"
-        raise LogError(path, "file", found, accepted)
+        raise LogError(path, "file", reason, accepted)
 
 
 def check_fields(names: Iterable[str | bytes], count: int) -> None:

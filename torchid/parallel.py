@@ -51,7 +51,8 @@ def one_thread() -> Iterator[None]:
     import torch
 
     global _outside
-    before, outermost = torch.get_num_threads(), _outside is None
+    before = torch.get_num_threads()
+    outermost = _outside is None
     torch.set_num_threads(1)
     try:
         if outermost:
@@ -105,7 +106,7 @@ def run_in_workers(tasks: Sequence[Item], run: Callable[[Iterator[Item]], T], wo
 
 def map_in_workers(tasks: Sequence[Item], work: Callable[[Item], T], workers: int | None = None) -> list[T]:
     """What a function makes of each task, in their order, by threads: by default as many as `thread_count`."""
-    parts = run_in_workers(tasks, lambda own: [work(task) for task in own], workers or thread_count())
+    parts = run_in_workers(tasks, lambda share: [work(task) for task in share], workers or thread_count())
     return [parts[number % len(parts)][number // len(parts)] for number in range(len(tasks))]
 
 
@@ -171,9 +172,9 @@ class Fork(Generic[T]):
         """What the function returns, or raises."""
         if self._results is not None:
             with suppress(EOFError, OSError, pickle.UnpicklingError):
-                found: tuple[T, ...] = pickle.loads(self._results.recv_bytes())
-                if found:
-                    return found[0]
+                results: tuple[T, ...] = pickle.loads(self._results.recv_bytes())
+                if results:
+                    return results[0]
         return self._work()
 
 
@@ -203,14 +204,16 @@ def share_between_processes(items: Sequence[Item], work: Callable[[Item], T], co
     """
     if distributed.world_size() == 1:
         return share_between_forks(items, work, count)
-    own = range(distributed.rank(), len(items), distributed.world_size())
+    share = range(distributed.rank(), len(items), distributed.world_size())
     with distributed.apart():
-        attempts = {number: _attempt(partial(work, items[number])) for number in own}
-    found = {
-        number: one for of_process in distributed.all_gather(attempts, "shares") for number, one in of_process.items()
+        attempts = {number: _attempt(partial(work, items[number])) for number in share}
+    outcomes = {
+        number: outcome
+        for of_process in distributed.all_gather(attempts, "shares")
+        for number, outcome in of_process.items()
     }
     return [
-        found[number][0] if found[number] else distributed.from_first(partial(work, item), "a share")
+        outcomes[number][0] if outcomes[number] else distributed.from_first(partial(work, item), "a share")
         for number, item in enumerate(items)
     ]
 
@@ -241,6 +244,6 @@ def _call(work: Callable[[], T], results: Connection, sender: Connection) -> Non
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if (torch := sys.modules.get("torch")) is not None:
         torch.set_num_threads(1)  # threads of the original are not there
-    found = _attempt(work)
+    outcome = _attempt(work)
     with suppress(Exception):
-        sender.send_bytes(pickle.dumps(found))  # `send` would leave tensors behind in this process
+        sender.send_bytes(pickle.dumps(outcome))  # `send` would leave tensors behind in this process

@@ -14,7 +14,8 @@ MASS = 0
 FIRST_MOMENT = slice(1, 4)
 INERTIA = slice(4, 10)
 FRICTION = slice(10, 12)
-COULOMB, VISCOUS = 10, 11
+COULOMB = 10
+VISCOUS = 11
 
 INERTIA_AXES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Row and column of each of the six inertia numbers in the inertia matrix."""

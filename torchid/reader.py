@@ -33,7 +33,9 @@ from torchid import errors
 from torchid.errors import InputError, LogError, TorchidWarning, about_file, current_file, excerpt, warn
 from torchid.guards import MAX_ARRAYS, check_regular
 
-MEMORY_BYTES, PROCESSOR_SECONDS, FREE_BYTES = 3 * 2**28, 10, 10_000_000
+MEMORY_BYTES = 3 * 2**28
+PROCESSOR_SECONDS = 10
+FREE_BYTES = 10_000_000
 """What reading may take of memory and of processor time, of files below so many bytes; more in proportion above."""
 
 LIMITS = "TORCHID_READ_LIMITS"
@@ -42,7 +44,9 @@ LIMITS = "TORCHID_READ_LIMITS"
 _MAX_HEADER = 2**28  # bytes of JSON in an answer
 _ANSWER_SECONDS = 20.0  # without an answer, per second of processor time that is allowed
 _POLL_SECONDS = 0.5
-_BYTES_OF_GROUP, _BYTES_OF_VALUE = 2**20, 100  # of values that are sent together; of each, beside its content
+# of values that are sent together; of each, beside its content
+_BYTES_OF_GROUP = 2**20
+_BYTES_OF_VALUE = 100
 _LENGTH = struct.Struct("<Q")
 _TO_JSON = json.JSONEncoder().encode
 _COMMAND = "import sys; sys.path[:] = {!r}; from torchid.reader import serve; serve()"
@@ -125,7 +129,9 @@ class _Reader:
     """A process that reads, from the side of who asks."""
 
     def __init__(self) -> None:
-        self._owner, self._path, self._limits = os.getpid(), Path(), (0, 0)
+        self._owner = os.getpid()
+        self._path = Path()
+        self._limits = (0, 0)
         command = [sys.executable, "-c", _COMMAND.format(sys.path)]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(
@@ -145,7 +151,8 @@ class _Reader:
 
     def open(self, opener: Opener, path: Path) -> None:
         times = max(1.0, path.stat().st_size / FREE_BYTES) * _factor()
-        self._path, self._limits = path, (int(times * MEMORY_BYTES), math.ceil(times * PROCESSOR_SECONDS))
+        self._path = path
+        self._limits = (int(times * MEMORY_BYTES), math.ceil(times * PROCESSOR_SECONDS))
         self.ask(
             {
                 "open": [opener.__module__, opener.__qualname__],
@@ -218,8 +225,8 @@ class _Reader:
         reason = signal.Signals(-code).name if code < 0 else f"status {code}"
         return f"its reader crashed ({reason})"
 
-    def _failure(self, found: str) -> LogError:
-        return LogError(self._path, "file", found, _accepted())
+    def _failure(self, reason: str) -> LogError:
+        return LogError(self._path, "file", reason, _accepted())
 
 
 def _factor() -> float:
@@ -353,9 +360,9 @@ class _Server:
                 texts = [x if isinstance(x, tuple) else str(x) for x in args]  # type: ignore[attr-defined]
                 self._send("error", [type(error).__module__, type(error).__name__, str(error), texts])
                 return
-        for one in caught:
-            if issubclass(one.category, TorchidWarning):
-                self._send("warning", [one.category.__name__, str(one.message)])
+        for warning in caught:
+            if issubclass(warning.category, TorchidWarning):
+                self._send("warning", [warning.category.__name__, str(warning.message)])
         self._send("end", None)
 
     def _answers(self, request: dict[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -388,14 +395,16 @@ class _Server:
 
 def _together(values: Iterable[Any]) -> Iterator[list[Any]]:
     """Values in groups of about so many bytes."""
-    group, size = list[Any](), 0
+    group = list[Any]()
+    size = 0
     for value in values:
         group.append(value)
         parts = value if isinstance(value, tuple) else (value,)
         size += _BYTES_OF_VALUE + sum(len(part) for part in parts if isinstance(part, bytes))
         if size > _BYTES_OF_GROUP:
             yield group
-            group, size = [], 0
+            group = []
+            size = 0
     yield group
 
 

@@ -9,7 +9,8 @@ from textwrap import wrap
 
 from torchid.errors import join_names
 
-REPR_LINES, _WIDTH = 10, 110
+REPR_LINES = 10
+_WIDTH = 110
 _UNBROKEN = "\N{NO-BREAK SPACE}"
 _TEXT = 60  # characters of one value
 
@@ -24,7 +25,8 @@ def short_repr(thing: object) -> str:
 
     `__repr__ = short_repr` in the body of a class; a dataclass keeps it. What is None or empty is left out.
     """
-    name, headline = type(thing).__name__, getattr(thing, "_headline", None)
+    name = type(thing).__name__
+    headline = getattr(thing, "_headline", None)
     if headline is None:
         lines = wrap(f"{name}({', '.join(_fields(thing, ''))})", _WIDTH, subsequent_indent="  ")
     else:

@@ -88,7 +88,9 @@ try:
 except ImportError:  # Windows: leftovers of killed processes are not removed
     fcntl = None  # type: ignore[assignment]
 
-NEW, OLD = "new", "old"  # names in a staging folder: the result, and the one that it replaces
+# names in a staging folder: the result, and the one that it replaces
+NEW = "new"
+OLD = "old"
 _NAME = re.compile(r"\..+-[a-z0-9_]{8}\.torchid", re.DOTALL)
 
 
@@ -122,7 +124,8 @@ def staging_folder(target: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be made.
     """
-    handle, folder = -1, target
+    handle = -1
+    folder = target
     try:
         with interrupts_deferred():
             while handle < 0:

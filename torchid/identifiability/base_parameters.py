@@ -80,7 +80,10 @@ class BaseParameters(nn.Module):
     ) -> None:
         """Created by `base_parameters`."""
         super().__init__()
-        self.kept, self.combination, self.free, self.scale = kept, combination, free, scale
+        self.kept = kept
+        self.combination = combination
+        self.free = free
+        self.scale = scale
         self.singular_values = singular_values
         self.rank, self.gap = rank_gap
         self.null_space = _null_space(kept, combination, free, scale)
@@ -146,7 +149,8 @@ def base_parameters(
     Warns:
         NumericalWarning: the rank is a matter of the tolerance.
     """
-    free, count = np.flatnonzero(problem.free), len(problem.scale)
+    free = np.flatnonzero(problem.free)
+    count = len(problem.scale)
     columns, units = _normalized_columns(problem, tolerance)
     _, values, Vh = scipy.linalg.svd(columns, lapack_driver="gesvd")  # gesdd can fail on dozens of null directions
     rank_gap = rank_and_gap(values, tolerance)
@@ -154,7 +158,8 @@ def base_parameters(
     weight = (_regrouping_preference(count) if preference is None else preference)[free]
     _, order = scipy.linalg.qr((null_space * weight[:, None]).T, mode="r", pivoting=True)
     null_dimension = len(free) - rank_gap.rank
-    dropped, kept = order[:null_dimension], np.sort(order[null_dimension:])
+    dropped = order[:null_dimension]
+    kept = np.sort(order[null_dimension:])
     regrouped = -np.linalg.solve(null_space[dropped].T, null_space[kept].T).T
     regrouped[np.abs(regrouped) < _ROUNDING] = 0.0
 
@@ -302,18 +307,16 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
         every = torch.arange(len(samples))
         for state, index in chunks_by_state(samples):
             counts[state] += len(every[index])
-    rows, left, values, weights = (
-        Counter[ContactState](),
-        defaultdict[ContactState, float](float),
-        defaultdict[ContactState, list[Tensor]](list),
-        defaultdict[ContactState, list[Tensor]](list),
-    )
+    rows = Counter[ContactState]()
+    independent_rows = defaultdict[ContactState, float](float)
+    values = defaultdict[ContactState, list[Tensor]](list)
+    weights = defaultdict[ContactState, list[Tensor]](list)
     for samples, state, weight in subsample_states(logs, _CHECKED):
         kinematics = builder.kinematics(samples.to(builder.device))
         if samples.resting is not None:
             nothing = kinematics.screw_axes.new_zeros(1, len(samples), builder.tree.n_rows)
             for inside in null_space_components(builder, state, kinematics, nothing):
-                left[state] += weight * float(torch.isfinite(inside).sum())
+                independent_rows[state] += weight * float(torch.isfinite(inside).sum())
         for _, V in builder.null_space_bases(state, kinematics):
             rows[state] = max(rows[state], V.shape[2] + len(builder.layout(state).uncoupled_joints))
             if builder.tree.base_rows:
@@ -328,7 +331,9 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
         )
         for state, count in counts.most_common()
     ]
-    means = (left[state] / count if state in left else None for state, count in counts.most_common())
+    means = (
+        independent_rows[state] / count if state in independent_rows else None for state, count in counts.most_common()
+    )
     return [replace(report, mean_rows=mean) for report, mean in zip(reports, means, strict=True)]
 
 
@@ -385,7 +390,7 @@ def _merged(same: Sequence[StateReport]) -> StateReport:
     ranks = dict(sorted(shares.items(), reverse=True))
     values = sorted((report.base_singular_value or 0.0, report.samples) for report in same)
     middle = sum(below <= samples / 2 for below in accumulate(count for _, count in values))
-    means = [(one.samples / samples, one.mean_rows) for one in same]
+    means = [(state_report.samples / samples, state_report.mean_rows) for state_report in same]
     mean_rows = sum(share * mean for share, mean in means if mean is not None) if means[0][1] is not None else None
     merged = replace(same[0], samples=samples, rows=max(report.rows for report in same), mean_rows=mean_rows)
     if not ranks:
@@ -410,14 +415,18 @@ def _describe_rank(report: StateReport) -> str:
     return f"rank {report.base_rank} of 6{share}"
 
 
-_ANGLE, _STROKE = 1.5, 0.3  # largest joint position [rad], [m]
+# largest joint position [rad], [m]
+_ANGLE = 1.5
+_STROKE = 0.3
 _ASSEMBLY = 0.3  # of random postures: from there the loops are closed for the first time
 _PATH = 10  # steps from one posture to another
 _REGULAR = 0.1  # of the least singular value of a loop Jacobian where it is largest, what must be left of it elsewhere
 _LEAST_SHARE = 0.01  # of the way to a random posture, to which a path is cut short
 _SAMPLES_PER_COLUMN = 2  # per state: a sample gives at least one row, and some directions are rarely excited
 _WEIGHTLESS = (0.0, 0.0, 0.0)
-_SOLE_STEPS, _SOLE_STEP = 30, 1.0  # that turn soles along the ground, and the longest of them [rad]
+# that turn soles along the ground, and the longest of them [rad]
+_SOLE_STEPS = 30
+_SOLE_STEP = 1.0
 _SOLE_RTOL = 1e-3  # of singular values of these steps: two of three directions of each sole count
 _AT_REST = 1e-10  # a projected velocity below this share of the drawn one is rounding and has no sign
 
@@ -482,7 +491,8 @@ def standing_samples(
         rng: draws them.
     """
     q, v, a = standing_states(robot, contacts, state, count, rng)
-    rows, base = robot.base_rows, BaseMotion.from_coordinates(q, v, a, robot.fixed_base)
+    rows = robot.base_rows
+    base = BaseMotion.from_coordinates(q, v, a, robot.fixed_base)
     return Samples(
         source="standing samples",
         time=torch.arange(count, dtype=torch.float64),
@@ -533,7 +543,10 @@ def standing_states(
     regular = values > KINEMATIC_TOLERANCE * values[:, :1]
     smallest = torch.where(regular, values, torch.inf).amin(1) / values[:, 0]
     best = torch.argsort(smallest, descending=True)[:count]
-    q, v, a, J = q[best], v[best], a[best], J[best]
+    q = q[best]
+    v = v[best]
+    a = a[best]
+    J = J[best]
     inverse = torch.linalg.pinv(J, rtol=KINEMATIC_TOLERANCE)
     v = _in_null_space(v, inverse, J)
     v = torch.where(v.abs() < _AT_REST, 0.0, v)
@@ -544,7 +557,8 @@ def standing_states(
 def resting_samples(joint_position: Array, state: ContactState) -> Samples:
     """Samples of an upright robot at rest, at joint positions (N, n) [rad or m] in a contact state, without forces."""
     q = torch.from_numpy(np.ascontiguousarray(joint_position, dtype=float))
-    still, base = torch.zeros_like(q), q.new_zeros(len(q), 3)
+    still = torch.zeros_like(q)
+    base = q.new_zeros(len(q), 3)
     upright, gravity = (q.new_tensor(x).expand(len(q), -1) for x in ((0.0, 0.0, 0.0, 1.0), GRAVITY_WORLD))
     return Samples(
         source="postures",
@@ -580,27 +594,32 @@ def closed_postures(robot: Robot, postures: Array) -> Array:
     Raises:
         UrdfError: loops that close nowhere near joint positions of 0.
     """
-    closures, steps = LoopClosures(robot), torch.from_numpy(postures) / _PATH
+    closures = LoopClosures(robot)
+    steps = torch.from_numpy(postures) / _PATH
     zero = torch.zeros(1, robot.n, dtype=torch.float64)
-    found, closed = closures.closed(torch.cat([zero, _ASSEMBLY * torch.from_numpy(postures)]))
+    positions, closed = closures.closed(torch.cat([zero, _ASSEMBLY * torch.from_numpy(postures)]))
     if not closed.any():
         size = float(closures.deviations(zero).abs().max())
         text = f"loops that are open by {size:.3g} m or rad at joint positions of 0, and close nowhere near"
         raise UrdfError(robot.path, LOOPS_FIELD, text, "frames that the joints can bring together")
-    found = found[closed]
-    found = found[found.abs().amax(1).argsort()]
-    values = torch.linalg.svdvals(closures.jacobian(found))
+    positions = positions[closed]
+    positions = positions[positions.abs().amax(1).argsort()]
+    values = torch.linalg.svdvals(closures.jacobian(positions))
     rank = int((values > KINEMATIC_TOLERANCE * values[:, :1]).sum(1).max())
     least = _REGULAR * float(values[:, rank - 1].max())
-    assembled = found[values[:, rank - 1] > least][:1]
-    out, left, share = assembled.repeat(len(postures), 1), torch.arange(len(postures)), 1.0
-    while len(left) and share > _LEAST_SHARE:
-        q, kept = assembled.repeat(len(left), 1), torch.ones(len(left), dtype=torch.bool)
+    assembled = positions[values[:, rank - 1] > least][:1]
+    out = assembled.repeat(len(postures), 1)
+    remaining = torch.arange(len(postures))
+    share = 1.0
+    while len(remaining) and share > _LEAST_SHARE:
+        q = assembled.repeat(len(remaining), 1)
+        kept = torch.ones(len(remaining), dtype=torch.bool)
         for _ in range(_PATH):
-            q, closed = closures.closed(q + share * steps[left])
+            q, closed = closures.closed(q + share * steps[remaining])
             kept &= closed & (torch.linalg.svdvals(closures.jacobian(q))[:, rank - 1] > least)
-        out[left[kept]] = q[kept]
-        left, share = left[~kept], share / 2.0
+        out[remaining[kept]] = q[kept]
+        remaining = remaining[~kept]
+        share = share / 2.0
     return np.asarray(out.numpy())
 
 
@@ -610,13 +629,15 @@ def _stand_on_soles(robot: Robot, soles: Sequence[Contact], q: Tensor) -> Tensor
     Newton's steps on the base's orientation and the joints; of postures from which they do not lead there none is left.
     """
     jacobians = [FrameJacobian(robot, contact.frame) for contact in soles]
-    rest = q.new_tensor([0.0] * 6 + [1.0] + [0.0] * robot.n)[None]
-    upward = [J(rest)[0, :3, 2] for J in jacobians]  # of the base's z axis in the frames
+    upright = q.new_tensor([0.0] * 6 + [1.0] + [0.0] * robot.n)[None]
+    upward = [J(upright)[0, :3, 2] for J in jacobians]  # of the base's z axis in the frames
     axes = [torch.where(up.abs() == up.abs().max(), up.sign(), 0.0) for up in upward]
     for _ in range(_SOLE_STEPS):
-        rows, wanted = [], []
+        rows = []
+        wanted = []
         for contact, jacobian, axis in zip(soles, jacobians, axes, strict=True):
-            J, normal = jacobian(q), q.new_tensor(contact.normal)
+            J = jacobian(q)
+            normal = q.new_tensor(contact.normal)
             normals = (J[:, :3, :3] @ (rotation_matrix(q[:, 3:7]).mT @ normal)[..., None])[..., 0]
             rows.append(torch.linalg.cross(normals[..., None], J[:, 3:, : robot.nv], dim=1))
             wanted.append(axis - normals)
@@ -637,7 +658,8 @@ def _in_null_space(x: Tensor, inverse: Tensor, J: Tensor) -> Tensor:
 
 def _random_states(robot: Robot, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
     q = random_postures(robot, count, rng)
-    v, a = rng.normal(size=(count, robot.nv)), 3.0 * rng.normal(size=(count, robot.nv))
+    v = rng.normal(size=(count, robot.nv))
+    a = 3.0 * rng.normal(size=(count, robot.nv))
     if not robot.fixed_base:
         q = np.hstack([np.zeros((count, 3)), Rotation.random(count, random_state=rng).as_quat(), q])
     return torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(a)
@@ -656,8 +678,8 @@ def _drift(robot: Robot, constrained: Sequence[Contact], q: Tensor, v: Tensor) -
             normal = (rotation_matrix(q[:, 3:7]).mT @ normal[..., None])[..., 0]
         pose = v.new_tensor(T_joint_frame)
         arms = contact_arms(states, node, pose[:3, :3], contact.radius, normal.T, contact.rolling_axis)
-        own = frame_acceleration(states, node, pose, arms)
-        rows.append(along_frame(states, node, pose, own)[list(contact.components)])
+        acceleration = frame_acceleration(states, node, pose, arms)
+        rows.append(along_frame(states, node, pose, acceleration)[list(contact.components)])
     if robot.loops:
         joints = (x[:, x.shape[1] - robot.n :] for x in (q, v))
         rows.append(LoopClosures(robot).drift(*joints).T)

@@ -242,9 +242,10 @@ class ParameterCovariance:
 
         It is their squared correlation, with variances as in `variance_shares`.
         """
-        own, of_other = self._bounded(sensitivity, noise), self._bounded(other, noise)
-        product = float(sensitivity @ own) * float(other @ of_other)
-        return float(other @ own) ** 2 / max(product, np.finfo(float).tiny)
+        along_sensitivity = self._bounded(sensitivity, noise)
+        of_other = self._bounded(other, noise)
+        product = float(sensitivity @ along_sensitivity) * float(other @ of_other)
+        return float(other @ along_sensitivity) ** 2 / max(product, np.finfo(float).tiny)
 
     def _bounded(self, sensitivity: Array, noise: float) -> Array:
         """Covariance of the parameters, each bounded by its scale, with a combination (P',) of them, (P',)."""
@@ -275,18 +276,19 @@ def _estimates(
     """Estimates of one elimination at identified and nominal parameters; `shared`: that of the unknowns of all logs."""
     P = len(covariance.free)
     sensitivity = elimination.inverse @ elimination.C[:, :P]
-    own, unobservable = [elimination.inverse], [elimination.unobservable]
+    roots = [elimination.inverse]
+    unobservable = [elimination.unobservable]
     if shared is not None:
         through = elimination.inverse @ elimination.C[:, P:]
         sensitivity = sensitivity - through @ shared.inverse @ shared.C[:, :P]
-        own.append(through @ shared.inverse)
+        roots.append(through @ shared.inverse)
         unobservable.append(through @ shared.unobservable)
     G = covariance.scale_sensitivity(sensitivity)
     mass = covariance.scale_sensitivity(mass_weights(P // parameters.PER_BODY)[None])[0]
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
     undetermined_by_bodies = np.linalg.norm(G @ covariance.null_space, axis=1) > UNOBSERVABLE_SHARE * size
     through_parameters = ((G @ covariance.root) ** 2).sum(1)
-    variance = sum((x**2).sum(1) for x in own) + through_parameters
+    variance = sum((x**2).sum(1) for x in roots) + through_parameters
     undetermined = (
         undetermined_by_bodies
         | ~elimination.determined
@@ -486,20 +488,24 @@ def _by_block(
     count = max(numbers.values()) + 1
     gradients = {name: np.zeros((count, width)) for name, width in _widths(assembly).items()}
     shares, of_noise = (np.zeros((count, basis.shape[1], basis.shape[1])) for _ in range(2))
-    columns, along = None, basis
+    columns = None
+    along = basis
     for part in sorted((part for part in parts if not part.unloaded), key=lambda part: part.source):
         if columns is None or columns.source != part.source:
             columns = _Columns.of(builder, assembly, part.source, phi)
             along = columns.by_phi @ basis
         number = numbers[_key(part)]
         for support, block in part.factor.blocks.items():
-            rows, at = np.ascontiguousarray(block.cpu().double().numpy()), list(support)  # the same bits from a cache
+            # the same bits from a cache
+            rows = np.ascontiguousarray(block.cpu().double().numpy())
+            at = list(support)
             residual = rows[:, -1] - rows[:, :-1] @ columns.values[at]
             columns.add_gradient(gradients, number, at, rows[:, :-1].T @ residual)
             projected = rows[:, :-1] @ along[at]
             shares[number] += projected.T @ projected
         for support, tensor in part.factor.noise_gram_of(assembly.reading_noise).items():
-            more, at = np.ascontiguousarray(tensor.cpu().double().numpy()), list(support)
+            more = np.ascontiguousarray(tensor.cpu().double().numpy())
+            at = list(support)
             columns.add_gradient(gradients, number, at, more[:-1, :-1] @ columns.values[at] - more[:-1, -1])
             of_noise[number] += along[at].T @ more[:-1, :-1] @ along[at]
     return gradients, shares, of_noise
@@ -511,7 +517,7 @@ def _name(log: str) -> str:
 
 def _widths(assembly: Assembly) -> dict[str, int]:
     return {"bodies": len(assembly.problem.nominal)} | {
-        _name(one.log): len(one.extras) for one in assembly.eliminations
+        _name(elimination.log): len(elimination.extras) for elimination in assembly.eliminations
     }
 
 
@@ -536,19 +542,27 @@ class _Columns:
 
     @classmethod
     def of(cls, builder: RowBuilder, assembly: Assembly, source: str, phi: Array) -> _Columns:
-        own = {one.log: number for number, one in enumerate(assembly.eliminations) if one.log in ("", source)}
-        values, by_phi = np.zeros(builder.width), np.zeros((builder.width, len(phi)))
+        numbers = {
+            eliminated.log: number
+            for number, eliminated in enumerate(assembly.eliminations)
+            if eliminated.log in ("", source)
+        }
+        values = np.zeros(builder.width)
+        by_phi = np.zeros((builder.width, len(phi)))
         count = builder.columns.count
-        values[:count], by_phi[:count] = builder.columns.parameter_map @ phi, builder.columns.parameter_map
-        at_best, sensitivities = assembly.extras_at(phi), assembly.extras_sensitivity()
+        values[:count] = builder.columns.parameter_map @ phi
+        by_phi[:count] = builder.columns.parameter_map
+        at_best = assembly.extras_at(phi)
+        sensitivities = assembly.extras_sensitivity()
         by_extras: dict[str, Array] = {}
-        for log, number in sorted(own.items()):  # that of all logs comes first
+        for log, number in sorted(numbers.items()):  # that of all logs comes first
             elimination = assembly.eliminations[number]
             places = [count + builder.extras.index(extra) for extra in elimination.extras]
-            values[places], by_phi[places] = at_best[number], sensitivities[number]
+            values[places] = at_best[number]
+            by_phi[places] = sensitivities[number]
             by_extras[log] = np.zeros((builder.width, len(places)))
             by_extras[log][places, range(len(places))] = 1.0
-            if log and "" in own:
+            if log and "" in numbers:
                 by_extras[""][places] = -elimination.inverse @ elimination.C[:, len(phi) :]
         return cls(source, values, by_phi, by_extras)
 
@@ -556,9 +570,11 @@ class _Columns:
 def _of_extras(gradients: dict[str, Array], bodies: Array, assembly: Assembly, factor: float) -> tuple[Array, ...]:
     """Deviations of the extra parameters of each elimination, (G, M), from those of the bodies', (G, 12 L)."""
     out: dict[str, Array] = {}
-    for one in sorted(assembly.eliminations, key=lambda elimination: elimination.log):  # that of all logs comes first
-        moved = np.hstack([bodies, out[""]]) if one.log and "" in out else bodies
-        direct = np.zeros((len(moved), len(one.extras)))
-        direct[: len(gradients[_name(one.log)])] = factor * gradients[_name(one.log)] @ one.inverse @ one.inverse.T
-        out[one.log] = direct - moved @ (one.inverse @ one.C[:, : moved.shape[1]]).T
-    return tuple(out[one.log] for one in assembly.eliminations)
+    that_of_all_logs_first = sorted(assembly.eliminations, key=lambda elimination: elimination.log)
+    for eliminated in that_of_all_logs_first:
+        moved = np.hstack([bodies, out[""]]) if eliminated.log and "" in out else bodies
+        direct = np.zeros((len(moved), len(eliminated.extras)))
+        gradient = gradients[_name(eliminated.log)]
+        direct[: len(gradient)] = factor * gradient @ eliminated.inverse @ eliminated.inverse.T
+        out[eliminated.log] = direct - moved @ (eliminated.inverse @ eliminated.C[:, : moved.shape[1]]).T
+    return tuple(out[eliminated.log] for eliminated in assembly.eliminations)

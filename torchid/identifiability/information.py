@@ -68,7 +68,10 @@ class SensorInformation:
         """The same with every matrix changed by a linear map."""
         return SensorInformation(
             change(self.total),
-            *({index: change(H) for index, H in of.items()} for of in (self.torques, self.limbs, self.wrenches)),
+            *(
+                {index: change(H) for index, H in matrices.items()}
+                for matrices in (self.torques, self.limbs, self.wrenches)
+            ),
         )
 
     def marginal(self, unknown: Sequence[int]) -> SensorInformation:
@@ -94,13 +97,15 @@ def sensor_information(
         most: approximate number of samples that represent all.
         done: called with the number of samples worked through.
     """
-    n, base = builder.tree.n, builder.tree.base_rows
+    n = builder.tree.n
+    base = builder.tree.base_rows
     joints = [x for x in np.flatnonzero(builder.sensors.torque[:n]).tolist() if x not in builder.motors.passive]
     in_limbs = builder.sensors.torque[n:].reshape(-1, 6)
     limbs = np.flatnonzero(in_limbs.any(axis=1)).tolist()
     components = measured_components(builder.contacts, builder.sensors)
     contacts = np.flatnonzero(components.any(axis=1)).tolist()
-    count, first = builder.width, 1 + len(joints) + len(limbs)
+    count = builder.width
+    first = 1 + len(joints) + len(limbs)
     units = torch.eye(builder.tree.n_rows, dtype=torch.float64, device=builder.device)
     torques = units[[base + joint for joint in joints]]
     total = torch.zeros(first + len(contacts), count, count, dtype=torch.float64, device=builder.device)
@@ -138,13 +143,13 @@ def add_information(parts: Sequence[SensorInformation]) -> SensorInformation:
     """Sum over logs whose only common unknowns are the columns."""
 
     def added(matrices: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
-        return {index: np.asarray(sum(one[index] for one in matrices)) for index in matrices[0]}
+        return {index: np.asarray(sum(part[index] for part in matrices)) for index in matrices[0]}
 
     return SensorInformation(
-        np.asarray(sum(one.total for one in parts)),
-        added([one.torques for one in parts]),
-        added([one.limbs for one in parts]),
-        added([one.wrenches for one in parts]),
+        np.asarray(sum(part.total for part in parts)),
+        added([part.torques for part in parts]),
+        added([part.limbs for part in parts]),
+        added([part.wrenches for part in parts]),
     )
 
 
@@ -172,8 +177,8 @@ def _marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Arra
     crossed = np.delete(H[list(unknown)], unknown, axis=1) * scale[:, None]
     values, V = np.linalg.eigh(H[np.ix_(unknown, unknown)] * scale * scale[:, None])
     along = V[:, values > KINEMATIC_TOLERANCE].T @ crossed
-    rest = np.delete(np.delete(H, unknown, axis=0), unknown, axis=1)
-    return np.asarray(rest - along.T @ (along / values[values > KINEMATIC_TOLERANCE, None]))
+    kept = np.delete(np.delete(H, unknown, axis=0), unknown, axis=1)
+    return np.asarray(kept - along.T @ (along / values[values > KINEMATIC_TOLERANCE, None]))
 
 
 def rows_information(rows: Tensor, weight: float) -> Tensor:
@@ -317,7 +322,8 @@ class ScaledParts:
     """Parts of logs with factors X: `X^T X` is a part's information in scaled columns, for correlated noise."""
 
     def __init__(self, parts: Sequence[Part], directions: Array, nuisance: NuisanceColumns) -> None:
-        self.parts, self.nuisance = parts, nuisance
+        self.parts = parts
+        self.nuisance = nuisance
         self._factors = [
             part.factor.triangle().numpy()[:-1, :-1] @ directions / np.sqrt(part.factor.oversampling) for part in parts
         ]
@@ -351,11 +357,13 @@ def leave_one_out(data: ScaledParts, names: Sequence[str], rank_tolerance: float
 
     groups = {name: [i for i, other in enumerate(names) if other == name] for name in dict.fromkeys(names)}
     factors = [data.together(chosen) for chosen in groups.values()]
-    everything, out = data.everything, []
+    everything = data.everything
+    out = []
     for name, factor, others in zip(groups, factors, _factors_of_others(data, groups, factors), strict=True):
         without = data.singular_values(others)
         lost = InformationGain.of(everything**2) - InformationGain.of(without**2)
-        samples, own_rank = sum(data.parts[i].samples for i in groups[name]), rank(data.singular_values(factor))
+        samples = sum(data.parts[i].samples for i in groups[name])
+        own_rank = rank(data.singular_values(factor))
         rank_lost = rank(everything) - rank(without)
         out.append(PartContribution(name, lost.bits, lost.determined, samples, own_rank, rank_lost))
     return out
@@ -409,7 +417,8 @@ def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Seq
     def gain(H: Array) -> InformationGain:
         return InformationGain.of(np.asarray(np.linalg.eigvalsh(H)))
 
-    everything, out = gain(information.total), []
+    everything = gain(information.total)
+    out = []
     limbs = [name.rpartition(".")[0] for name in dof_names[builder.tree.n :: 6]]
     for kind, names, lost in (
         ("joint torque", dof_names, information.torques),

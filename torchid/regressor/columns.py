@@ -19,7 +19,8 @@ _Vector = Sequence[Tensor]
 ALL_INERTIAL = tuple(range(parameters.INERTIAL.stop))
 _REVOLUTE_KEPT = (1, 2, 4, 5, 6, 8, 9)  # mcx, mcy, Ixx, Ixy, Ixz, Iyz, Izz
 _PRISMATIC_KEPT = (0, 1, 2, 3)  # m, mcx, mcy, mcz
-_IXX, _IYY = 4, 7
+_IXX = 4
+_IYY = 7
 _TOGETHER = 2**15  # bodies times samples: what is worked out for them stays in a processor's second-level cache
 
 
@@ -67,14 +68,16 @@ def reduced_layout(tree: KinematicTree) -> ColumnLayout:
 
 def reduction_matrix(tree: KinematicTree) -> Array:
     """B, (columns of `reduced_layout`, 10 L) for L bodies, with `K = K_reduced @ B` for the inertial columns of K."""
-    layout, width = reduced_layout(tree), parameters.INERTIAL.stop
+    layout = reduced_layout(tree)
+    width = parameters.INERTIAL.stop
     effective = np.zeros((tree.n_nodes, width, width * tree.n_nodes))
     for body in range(tree.n_nodes):
-        own = slice(width * body, width * (body + 1))
-        effective[body][:, own] = parameters.change_of_frame(tree.T_joint_link[body])
+        of_body = slice(width * body, width * (body + 1))
+        effective[body][:, of_body] = parameters.change_of_frame(tree.T_joint_link[body])
     rows = np.zeros((layout.count, width * tree.n_nodes))
     for body in reversed(range(tree.n_nodes)):
-        kept, regrouped = np.zeros((width, width)), np.eye(width)
+        kept = np.zeros((width, width))
+        regrouped = np.eye(width)
         for column in layout.kept[body]:
             kept[column, column] = 1.0
         regrouped -= kept
@@ -125,11 +128,13 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor, is
     Source: the Newton-Euler equations of a body about its frame's origin, sorted by parameter.
     """
     forces_of, moments_of = _unit_wrenches(states, columns)
-    n_with_force, rotation = len(forces_of), states.rotation
+    n_with_force = len(forces_of)
+    rotation = states.rotation
     if not is_reused:
         local = torch.stack([vector[axis] for axis in range(3) for vector in (*moments_of, *forces_of)])
         local = local.unflatten(0, (3, -1)).transpose(1, 2)  # (3, k, vectors, B)
-        moments, forces = local[:, :, : len(columns)], local[:, :, len(columns) :]
+        moments = local[:, :, : len(columns)]
+        forces = local[:, :, len(columns) :]
         forces = rotate_vectors(rotation.unsqueeze(3), forces)
         out[:3, :, :n_with_force] = forces
         out[3:] = rotate_vectors(rotation.unsqueeze(3), moments)
@@ -156,7 +161,9 @@ def _unit_wrenches(states: BodyStates, columns: Sequence[int]) -> tuple[list[_Ve
         for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
     )
     cyclic = torch.cat([omega, omega[:2]])
-    squares, products = cyclic * cyclic, cyclic[1:4] * cyclic[2:]  # ..., (yz, zx, xy)
+    # ..., (yz, zx, xy)
+    squares = cyclic * cyclic
+    products = cyclic[1:4] * cyclic[2:]
     yz, xz, xy = products.unbind()
     less_yz, less_xz, less_xy = products.neg().unbind()
     ax, ay, az = alpha.unbind()
@@ -178,7 +185,8 @@ def _unit_wrenches(states: BodyStates, columns: Sequence[int]) -> tuple[list[_Ve
             ((plus_y, reversed_x, inward_z), (less_fy, fx, zero)),
         ]
         chosen = [of_forces[column] for column in columns if column < parameters.INERTIA.start]
-        forces, moments = [x for x, _ in chosen], [x for _, x in chosen]
+        forces = [x for x, _ in chosen]
+        moments = [x for _, x in chosen]
     of_inertias = {
         (0, 0): (ax, xz, less_xy),
         (0, 1): (minus_y, plus_x, differ_z),

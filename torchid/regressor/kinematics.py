@@ -84,7 +84,8 @@ def motion_from_state(
     if fixed_base:
         zero = q.new_zeros(q.shape[0], 3)
         return Motion(q, v, a, zero, zero, zero - g_world)
-    linear, angular = v[:, :3], v[:, 3:6]
+    linear = v[:, :3]
+    angular = v[:, 3:6]
     g_base = (rotation_matrix(q[:, 3:7]).mT @ g_world[:, None])[..., 0]
     specific_force = a[:, :3] + torch.linalg.cross(angular, linear) - g_base
     return Motion(q[:, 7:], v[:, 6:], a[:, 6:], angular, a[:, 3:6], specific_force)
@@ -179,8 +180,10 @@ def require_precision(tree: KinematicTree, tensors: Mapping[str, Tensor | None])
     for name, x in tensors.items():
         for what in ("dtype", "device"):
             expected = getattr(tree.joint_map, what)
-            if isinstance(x, Tensor) and (found := getattr(x, what)) != expected:
-                raise TypeError(f"{name}: found {found}; accepted: {expected}, the module's, which .to({what}) changes")
+            if isinstance(x, Tensor) and (actual := getattr(x, what)) != expected:
+                raise TypeError(
+                    f"{name}: found {actual}; accepted: {expected}, the module's, which .to({what}) changes"
+                )
 
 
 def independent_positions(tree: KinematicTree, q: Tensor) -> Tensor:
@@ -211,7 +214,8 @@ def link_states(tree: KinematicTree, states: BodyStates) -> BodyStates:
     if not tree.has_link_offsets:
         return BodyStates(rotation, *list(vars(states).values())[1:])
     arm = rotate_vectors(states.rotation, tree.link_offset)
-    omega, alpha = states.angular_velocity, states.angular_acceleration
+    omega = states.angular_velocity
+    alpha = states.angular_acceleration
     force = states.specific_force + cross_product(alpha, arm) + cross_product(omega, cross_product(omega, arm))
     return BodyStates(rotation, states.position + arm, omega, alpha, force)
 
@@ -221,15 +225,18 @@ def joint_frame_poses(tree: KinematicTree, position: Tensor) -> tuple[Tensor, Te
     position = position.index_select(0, tree.by_depth)
     angle = position * tree.revolute.index_select(0, tree.by_depth)
     slide = position * tree.prismatic.index_select(0, tree.by_depth) if any(tree.slides) else None
-    cosine, sine = torch.cos(angle), torch.sin(angle)
+    cosine = torch.cos(angle)
+    sine = torch.sin(angle)
     identity = torch.eye(3, 4, dtype=position.dtype, device=position.device)[..., None, None]
     parent_poses = identity.expand(3, 4, 1, position.shape[-1])
-    levels, start = [parent_poses], 1
+    levels = [parent_poses]
+    start = 1
     for size in tree.level_sizes[1:]:
         level = slice(start, start + size)
         parent_poses = parent_poses.index_select(2, tree.parent_in_level[level])
         unmoved = rotate_vectors(parent_poses[:, :, None], tree.pose[:, None, :, level])
-        c, s = cosine[level], sine[level]
+        c = cosine[level]
+        s = sine[level]
         x, y, z, origin = unmoved.unbind(1)
         origin = origin + parent_poses[:, 3]
         if slide is not None:
@@ -286,7 +293,8 @@ def frame_acceleration(states: BodyStates, body: int, T_joint_frame: Tensor, arm
     the acceleration of the material point, whose arm turns with the body.
     """
     arm = (states.rotation[:, :, body] * T_joint_frame[:3, 3, None]).sum(1)
-    omega, alpha = states.angular_velocity[:, body], states.angular_acceleration[:, body]
+    omega = states.angular_velocity[:, body]
+    alpha = states.angular_acceleration[:, body]
     linear = (
         states.specific_force[:, body] + cross_product(alpha, arm) + cross_product(omega, cross_product(omega, arm))
     )

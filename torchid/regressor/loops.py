@@ -31,7 +31,9 @@ _POSTURES = 16  # random ones, from which constant directions without work are t
 _LARGEST = 1.5  # rad or m, of their joint positions
 _CLOSED = 1e-12  # m or rad: a gap that is rounding
 _STANDS = 1e-10  # rad or m: after a smaller step, the next of Gauss-Newton is rounding
-_MOST_STEPS, _LARGEST_STEP = 100, 0.3  # of Gauss-Newton, and of a joint in one of them [rad or m]
+# of Gauss-Newton, and of a joint in one of them [rad or m]
+_MOST_STEPS = 100
+_LARGEST_STEP = 0.3
 _DAMPING = 1e-10  # of squares of a loop Jacobian's singular values, as a share of their sum
 
 
@@ -54,10 +56,10 @@ class LoopGeometry:
     @classmethod
     def of(cls, loop: Loop, robot: Robot, tree: KinematicTree) -> LoopGeometry:
         """The geometry of a loop in a robot's tree."""
-        (one, T_one), (other, T_other) = (tree.frame(robot, frame) for frame in loop.frames)
-        paths = [set(tree.path(node)) for node in (one, other)]
+        (first, T_one), (second, T_other) = (tree.frame(robot, frame) for frame in loop.frames)
+        paths = [set(tree.path(node)) for node in (first, second)]
         apart = sorted(paths[0] ^ paths[1])
-        return cls(loop, (one, other), (T_one, T_other), tuple((x, 1.0 if x in paths[0] else -1.0) for x in apart))
+        return cls(loop, (first, second), (T_one, T_other), tuple((x, 1.0 if x in paths[0] else -1.0) for x in apart))
 
     @cached_property
     def unit_wrenches(self) -> Array:
@@ -83,7 +85,8 @@ class LoopGeometry:
             (k, len(dofs), B) [N m or N].
         """
         nodes, signs = zip(*self.moving, strict=True)
-        index, at = tree.index(nodes), tree.index(dofs)
+        index = tree.index(nodes)
+        at = tree.index(dofs)
         signed = tree.joint_map[index][:, at] * tree.joint_map.new_tensor(signs)[:, None]
         screws = signed.T @ screw_axes[:, index]
         return (wrenches[:, :, None] * screws[:, None]).sum(0)
@@ -108,7 +111,8 @@ class LoopGeometry:
 
 def _frame(rotation: Tensor, position: Tensor, node: int, pose: Array) -> tuple[Tensor, Tensor]:
     """Rotation (3, 3, B) and position (3, B) of a frame on a node."""
-    T, R = rotation.new_tensor(pose), rotation[:, :, node]
+    T = rotation.new_tensor(pose)
+    R = rotation[:, :, node]
     origin = position[:, node] + (R * T[:3, 3, None]).sum(1)
     return (R[:, :, None] * T[None, :3, :3, None]).sum(1), origin
 
@@ -152,7 +156,8 @@ class LoopClosures:
 
         The angle of a point is 0.
         """
-        poses, out = self._poses(joint_position), []
+        poses = self._poses(joint_position)
+        out = []
         for loop in self.geometries:
             offset, turned = loop.deviation(*poses)
             angle = _rotation_angle(turned) if loop.loop.kind == "weld" else torch.zeros_like(offset[0])
@@ -161,7 +166,8 @@ class LoopClosures:
 
     def deviations(self, joint_position: Tensor) -> Tensor:
         """Deviations of all loops that `jacobian` has rows for, (B, k) [m, rad], at joint positions (B, n)."""
-        poses, rows = self._poses(joint_position), []
+        poses = self._poses(joint_position)
+        rows = []
         for loop in self.geometries:
             offset, turned = loop.deviation(*poses)
             rows += [offset] if loop.loop.kind == "point" else [offset, _rotation_vector(turned)]
@@ -188,7 +194,8 @@ class LoopClosures:
             number: of the loop.
             dofs: degrees of freedom that are measured.
         """
-        loop, n = self.geometries[number], self.tree.n
+        loop = self.geometries[number]
+        n = self.tree.n
         generator = torch.Generator().manual_seed(0)
         q = _LARGEST * (2.0 * torch.rand(_POSTURES, n, generator=generator, dtype=torch.float64) - 1.0)
         work = loop.jacobian(self.tree, states_at_rest(self.tree, q), dofs).flatten(1).numpy()  # (k, dofs x postures)
@@ -215,9 +222,11 @@ class LoopClosures:
 
     def fitted(self, joint_position: Tensor, free: Sequence[int]) -> Tensor:
         """Positions (B, n) of which some joints move to where the loops are least open, by Gauss-Newton steps."""
-        q, moving = joint_position.clone(), list(free)
+        q = joint_position.clone()
+        moving = list(free)
         for _ in range(_MOST_STEPS):
-            J, gap = self.jacobian(q)[:, :, moving], self.deviations(q)
+            J = self.jacobian(q)[:, :, moving]
+            gap = self.deviations(q)
             step = torch.linalg.solve(_damped(J.mT @ J), J.mT @ gap[..., None])[..., 0]
             size = step.abs().amax(1, keepdim=True)
             q[:, moving] += step * (_LARGEST_STEP / size.clamp_min(_LARGEST_STEP))
@@ -229,12 +238,13 @@ class LoopClosures:
         """dJ/dt v of `jacobian`, (B, k), at positions of closed loops and velocities (B, n) that keep them closed."""
         zero = torch.zeros_like(joint_position)
         still = zero.new_zeros(len(zero), 3)
-        motion, rows = Motion(joint_position, joint_velocity, zero, still, still, still), []
+        motion = Motion(joint_position, joint_velocity, zero, still, still, still)
+        rows = []
         states = body_states(self.tree, motion, joint_motion(self.tree, motion))
         for loop in self.geometries:
             poses = [zero.new_tensor(pose) for pose in loop.poses]
-            one, other = (frame_acceleration(states, *at) for at in zip(loop.nodes, poses, strict=True))
-            rows.append(along_frame(states, loop.nodes[0], poses[0], one - other)[list(loop.loop.components)])
+            first, second = (frame_acceleration(states, *at) for at in zip(loop.nodes, poses, strict=True))
+            rows.append(along_frame(states, loop.nodes[0], poses[0], first - second)[list(loop.loop.components)])
         return torch.cat(rows).T
 
     def _poses(self, joint_position: Tensor) -> tuple[Tensor, Tensor]:

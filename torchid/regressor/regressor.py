@@ -84,7 +84,8 @@ class Regressor(nn.Module):
 
     def from_motion(self, motion: Motion) -> Tensor:
         """As `forward`, from a `Motion` (which has no base position, heading or linear velocity)."""
-        tree, columns = self.tree, self._columns
+        tree = self.tree
+        columns = self._columns
         joints = joint_motion(tree, motion)
         states = body_states(tree, motion, joints)
         screw_axes = joint_screw_axes(tree, states)
@@ -137,7 +138,8 @@ def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, screw_ax
         return ratio * _torque(screw_axes[:, body], wrenches[:, row.start : row.end])
     total = wrenches.new_zeros(row.end - row.start, wrenches.shape[-1])
     for body, ratio in row.moved:
-        start, end = layout.starts[body], layout.starts[tree.subtree_end[body]]
+        start = layout.starts[body]
+        end = layout.starts[tree.subtree_end[body]]
         part = ratio * _torque(screw_axes[:, body], wrenches[:, start:end])
         total = total + torch.nn.functional.pad(part, (0, 0, start - row.start, row.end - end))
     return total
@@ -167,7 +169,8 @@ def wrenches_at_base(states: BodyStates, body: int, wrenches: Tensor, arms: Tens
 
     `arms`: (3, 3, B), of `rolling_arms`, if their forces act where a contact rolls rather than in its frame's origin.
     """
-    rotation, position = states.rotation[:, :, body], states.position[:, body]
+    rotation = states.rotation[:, :, body]
+    position = states.position[:, body]
     force = wrenches[:, :3] @ rotation
     moment = wrenches[:, 3:] @ rotation + cross_product(position[:, None].expand_as(force), force)
     if arms is not None:
@@ -243,7 +246,8 @@ def generalized_forces(
 
 def wrench_transform(T: Array) -> Array:
     """Matrix (6, 6) that expresses a wrench at a frame, in its axes, in another, where `T`, (4, 4) [m], is its pose."""
-    R, p = T[:3, :3], T[:3, 3]
+    R = T[:3, :3]
+    p = T[:3, 3]
     return np.block([[R, np.zeros((3, 3))], [np.cross(np.eye(3), p) @ R, R]])
 
 
@@ -299,7 +303,8 @@ class FrameJacobian(nn.Module):
         unit_wrenches = wrench_transform(T_joint_frame).T
         self.register_buffer("unit_wrenches", torch.tensor(unit_wrenches.copy()), persistent=False)
         self._joints = range(robot.n_dofs)
-        self.radius, self.axis = radius, axis
+        self.radius = radius
+        self.axis = axis
 
     def forward(self, q: Tensor, normal: Tensor | None = None) -> Tensor:
         """Jacobian at coordinates.
@@ -319,7 +324,8 @@ class FrameJacobian(nn.Module):
         """
         tree = self.tree
         states = states_at_rest(tree, independent_positions(tree, q))
-        units, arms = self.get_buffer("unit_wrenches"), None
+        units = self.get_buffer("unit_wrenches")
+        arms = None
         if self.radius:
             up = q.new_tensor([0.0, 0.0, 1.0]) if normal is None else normal.to(q)
             up = up.expand(len(q), 3)

@@ -40,11 +40,15 @@ class Node:
 
 def tree_nodes(robot: Robot) -> list[Node]:
     """All nodes, depth first."""
-    geometry, (matrix, constant) = robot.geometry, robot.joint_map
-    dofs, nodes, node_of = np.eye(robot.n_dofs), list[Node](), list[int]()
+    geometry = robot.geometry
+    (matrix, constant) = robot.joint_map
+    dofs = np.eye(robot.n_dofs)
+    nodes = list[Node]()
+    node_of = list[int]()
     for index, body in enumerate(robot.bodies):
         parent = node_of[body.parent] if index else -1
-        T_parent_joint, T_joint_link = geometry.T_parent_joint[index], geometry.T_joint_link[index]
+        T_parent_joint = geometry.T_parent_joint[index]
+        T_joint_link = geometry.T_joint_link[index]
         if body.joint is not None and geometry.welded[index]:
             first = robot.dof_names.index(f"{body.joint.name}.fx")
             sign = geometry.axis[index, 2]
@@ -109,17 +113,22 @@ class KinematicTree(nn.Module):
         super().__init__()
         if not isinstance(robot, Robot):
             raise TypeError(f"robot: found {type(robot).__name__}; accepted: what torchid.load_robot returns")
-        self.sign_width, self.stribeck = sign_width, stribeck
+        self.sign_width = sign_width
+        self.stribeck = stribeck
         self._indices: dict[tuple[int, ...], Tensor] = {}
         self._path_maps: dict[tuple[int, ...], tuple[slice | Tensor, Tensor | None]] = {}
         nodes = tree_nodes(robot)
-        self._nodes, self._body_names = nodes, robot.body_names
+        self._nodes = nodes
+        self._body_names = robot.body_names
         self.node_of = [index for index, node in enumerate(nodes) if node.body is not None]
         self.body_of = np.searchsorted(self.node_of, np.arange(len(nodes))).tolist()
         self.parents = [node.parent for node in nodes]
         self.slides = [node.slides for node in nodes]
         self.kinds = [node.kind for node in nodes]
-        self.base_rows, self.n, self.n_dofs, self.n_rows = robot.base_rows, robot.n, robot.n_dofs, robot.n_rows
+        self.base_rows = robot.base_rows
+        self.n = robot.n
+        self.n_dofs = robot.n_dofs
+        self.n_rows = robot.n_rows
         count = self.n_nodes = len(nodes)
         joint_frame = np.tile(np.eye(4), (count, 1, 1))
         for index, node in enumerate(nodes[1:], start=1):
@@ -183,16 +192,18 @@ class KinematicTree(nn.Module):
         Raises:
             InputError: it is another robot's.
         """
-        own = self.get_extra_state()
-        if state.shape != own.shape:
-            sizes = [f"{len(x)} frames and {x.shape[1] - own.shape[1] + self.n_dofs} joints" for x in (state, own)]
-            found = f"another one, of {' instead of '.join(sizes)}"
-        elif differs := ((state.to(own) - own).abs().amax(dim=1) > _SAME).nonzero()[:, 0].tolist():
+        expected = self.get_extra_state()
+        if state.shape != expected.shape:
+            sizes = [
+                f"{len(x)} frames and {x.shape[1] - expected.shape[1] + self.n_dofs} joints" for x in (state, expected)
+            ]
+            reason = f"another one, of {' instead of '.join(sizes)}"
+        elif differs := ((state.to(expected) - expected).abs().amax(dim=1) > _SAME).nonzero()[:, 0].tolist():
             bodies = dict.fromkeys(self._body_names[self.body_of[node]] for node in differs)
-            found = f"another one, which differs at {join_names(list(bodies))}"
+            reason = f"another one, which differs at {join_names(list(bodies))}"
         else:
             return
-        raise InputError("load_state_dict", "robot", found, "the state of a module of the same robot")
+        raise InputError("load_state_dict", "robot", reason, "the state of a module of the same robot")
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> KinematicTree:
         self._indices.clear()

@@ -44,7 +44,8 @@ class MjcfText:
 
     def __init__(self, path: Path) -> None:
         """Read the files. Raises UrdfError: one of them is missing, or no well-formed XML, or there are too many."""
-        self.path, self._files = path, dict[Path, etree._Element]()
+        self.path = path
+        self._files = dict[Path, etree._Element]()
         self.root = self._expanded(path, "mujoco")
 
     @property
@@ -79,7 +80,8 @@ class MjcfText:
         named = list(bodies)
         for number, name in enumerate(bodies):
             named[number] = name or _unused(f"body{number}", {*named, *bodies})
-        out, taken = list[str](), {name for _, name in joints}
+        out = list[str]()
+        taken = {name for _, name in joints}
         for body, name in joints:
             out.append(name or _unused(f"{named[body]}_joint", taken))
             taken.add(out[-1])
@@ -103,11 +105,11 @@ class MjcfText:
 
     def _included(self, by: Path, file: str) -> Path:
         """The file that another includes: beside it, or else beside the main one; UrdfError where there is none."""
-        found = next((path for path in (by.parent / file, self.path.parent / file) if path.is_file()), None)
-        if found is None:
+        included = next((path for path in (by.parent / file, self.path.parent / file) if path.is_file()), None)
+        if included is None:
             accepted = f"a file beside {' or '.join(dict.fromkeys((by.name, self.path.name)))}"
             raise UrdfError(by, "<include>", f"'{excerpt(file)}', which is not there", accepted)
-        return found
+        return included
 
 
 def body_elements(root: etree._Element) -> list[tuple[etree._Element, list[etree._Element]]]:
@@ -149,9 +151,11 @@ def _is_default(element: etree._Element) -> bool:
 
 
 def _unused(name: str, taken: set[str]) -> str:
-    number, out = 2, name
+    number = 2
+    out = name
     while out in taken:
-        out, number = f"{name}_{number}", number + 1
+        out = f"{name}_{number}"
+        number = number + 1
     return out
 
 
@@ -177,7 +181,8 @@ class MjcfModel:
 
     def __init__(self, path: Path) -> None:
         """Read and compile a file. Raises UrdfError: MuJoCo does not take it, or it has no joint."""
-        self.path, self.text = path, MjcfText(path)
+        self.path = path
+        self.text = MjcfText(path)
         _try_to_read(path, path.stat().st_mtime_ns)
         try:
             with warnings.catch_warnings():
@@ -203,7 +208,8 @@ class MjcfModel:
 
     def joints_of(self, body: int) -> range:
         """Numbers of the joints that move a body, in order, without a free one."""
-        first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
+        first = int(self.model.body_jntadr[body])
+        count = int(self.model.body_jntnum[body])
         return range(first, first + count) if count and not self.is_free(body) else range(0)
 
     def is_free(self, body: int) -> bool:
@@ -226,10 +232,10 @@ class MjcfModel:
 
     def inertial(self, body: int) -> Array:
         """Inertial parameters (10,) of a body in its frame."""
-        of = self.model
-        R = pose(np.zeros(3), of.body_iquat[body])[:3, :3]
-        about_com = R @ np.diag(of.body_inertia[body]) @ R.T
-        return inertial_vector(float(of.body_mass[body]), of.body_ipos[body], about_com)
+        compiled = self.model
+        R = pose(np.zeros(3), compiled.body_iquat[body])[:3, :3]
+        about_com = R @ np.diag(compiled.body_inertia[body]) @ R.T
+        return inertial_vector(float(compiled.body_mass[body]), compiled.body_ipos[body], about_com)
 
     @property
     def computes_inertias(self) -> bool:
@@ -243,9 +249,9 @@ class MjcfModel:
         """Whether MuJoCo computes stiffness and damping of a joint from the inertia that it moves."""
         return joint in self._spring_dampers
 
-    def refuse(self, element: Any, tag: str, name: str, found: str, accepted: str) -> NoReturn:
+    def refuse(self, element: Any, tag: str, name: str, reason: str, accepted: str) -> NoReturn:
         """Refuse an element of the specification, by its line. Raises UrdfError: always."""
-        raise UrdfError(self.path, self.label(element, tag, name), found, accepted)
+        raise UrdfError(self.path, self.label(element, tag, name), reason, accepted)
 
     def label(self, element: Any, tag: str, name: str) -> str:
         """An element of the specification by tag, name and line: "<joint> 'knee', line 12 of leg.xml"."""
@@ -268,7 +274,10 @@ class MjcfModel:
         Returns:
             Geoms with the meshes that they name, and those geoms whose shape has been dropped.
         """
-        spec, had, kept, dropped = self.spec, list[tuple[Any, MeshShape]](), set[str](), list[Any]()
+        spec = self.spec
+        had = list[tuple[Any, MeshShape]]()
+        kept = set[str]()
+        dropped = list[Any]()
         spec.compiler.fusestatic = spec.compiler.discardvisual = False
         files = {mesh.name or Path(mesh.file).stem: mesh for mesh in spec.meshes}
         folder = Path(spec.compiler.meshdir or "")
@@ -281,7 +290,9 @@ class MjcfModel:
                     x, y, z = mesh.scale
                     had.append((geom, MeshShape(str(folder / mesh.file), (float(x), float(y), float(z)))))
                 if (geom.meshname or field) and not self._gives_inertia(geom, body):
-                    geom.type, geom.meshname, geom.hfieldname = mujoco.mjtGeom.mjGEOM_SPHERE, "", ""
+                    geom.type = mujoco.mjtGeom.mjGEOM_SPHERE
+                    geom.meshname = ""
+                    geom.hfieldname = ""
                     geom.size = [_PLACEHOLDER, 0.0, 0.0]
                     dropped.append(geom)
                 elif geom.meshname:
@@ -326,10 +337,10 @@ class MjcfModel:
         dofs = {base: sum(int(model.body_dofnum[i]) for i in below) for base, below in trees.items()}
         most = [base for base in dofs if dofs[base] == max(dofs.values())]
         if len(most) > 1:
-            found = f"several trees of {max(dofs.values())} degrees of freedom: " + ", ".join(
+            reason = f"several trees of {max(dofs.values())} degrees of freedom: " + ", ".join(
                 self.bodies[x] for x in most
             )
-            raise UrdfError(self.path, "<worldbody>", found, "one that has more than the others, the robot")
+            raise UrdfError(self.path, "<worldbody>", reason, "one that has more than the others, the robot")
         if len(trees[most[0]]) > MAX_LINKS:
             raise UrdfError(self.path, "<body>", f"{len(trees[most[0]])} of them", f"at most {MAX_LINKS}")
         return most[0], trees[most[0]]
@@ -350,8 +361,8 @@ def _try_to_read(path: Path, _: int) -> None:
     except LogError as error:
         raise UrdfError(path, "MJCF", error.found, f"{accepted}; or {error.accepted}") from error
     except Exception as error:  # noqa: B902 - C++ raises what it likes, mostly as there is no memory
-        found = f"MuJoCo fails to read it ({excerpt(str(error))})"
-        raise UrdfError(path, "MJCF", found, accepted) from error
+        reason = f"MuJoCo fails to read it ({excerpt(str(error))})"
+        raise UrdfError(path, "MJCF", reason, accepted) from error
 
 
 @contextmanager
@@ -364,9 +375,11 @@ def _read_mjcf(path: Path) -> Iterator[None]:
 
 def pose(position: Array, quat_wxyz: Array) -> Array:
     """Pose (4, 4) [m] of a frame with an origin (3,) [m] and a unit quaternion."""
-    T, R = np.eye(4), np.zeros(9)
+    T = np.eye(4)
+    R = np.zeros(9)
     mujoco.mju_quat2Mat(R, quat_wxyz)
-    T[:3, :3], T[:3, 3] = R.reshape(3, 3), position
+    T[:3, :3] = R.reshape(3, 3)
+    T[:3, 3] = position
     return T
 
 
@@ -401,7 +414,8 @@ def check_model(model: MjcfModel) -> None:
     Warns:
         TorchidWarning: the model's gravity is not the Earth's, which is used.
     """
-    spec, members = model.spec, {model.bodies[i] for i in model.members}
+    spec = model.spec
+    members = {model.bodies[i] for i in model.members}
     for element in model.text.root.iter("inertial"):  # MuJoCo takes a NaN for an attribute that is not there
         if any(word.lower().lstrip("+-") in ("nan", "inf") for x in element.attrib.values() for word in x.split()):
             field = f"<inertial>, line {element.sourceline}"
@@ -455,8 +469,8 @@ def _check_free_joint(model: MjcfModel, joint: Any) -> None:
     for name in ("armature", "damping", "frictionloss", "stiffness"):
         value = np.atleast_1d(getattr(joint, name))
         if value.any():
-            found = f"{name} {_numbers(value)} of a free joint"
-            model.refuse(joint, "joint", joint.name, found, f"{name} 0, or <freejoint/>")
+            reason = f"{name} {_numbers(value)} of a free joint"
+            model.refuse(joint, "joint", joint.name, reason, f"{name} 0, or <freejoint/>")
 
 
 def _check_transmissions(model: MjcfModel) -> None:
@@ -498,8 +512,8 @@ def mimic_of(model: MjcfModel, equality: Any) -> tuple[str, str, float, float] |
         return _mimic_of_tendon(model, equality)
     if equality_kind(equality) != "joint" or not (equality.active and equality.name1 and equality.name2):
         return None
-    c0, c1, *rest = equality.data[:5]
-    if any(rest) or not c1:
+    c0, c1, *higher = equality.data[:5]
+    if any(higher) or not c1:
         return None
     follower, master = (model.model.joint(name) for name in (equality.name1, equality.name2))
     reference = [float(model.model.qpos0[int(joint.qposadr[0])]) for joint in (follower, master)]
@@ -508,14 +522,15 @@ def mimic_of(model: MjcfModel, equality: Any) -> tuple[str, str, float, float] |
 
 def _mimic_of_tendon(model: MjcfModel, equality: Any) -> tuple[str, str, float, float] | None:
     """As `mimic_of`, of the two joints of a fixed tendon of constant length; the second follows the first."""
-    of, tendon = model.model, int(model.model.eq_obj1id[equality.id])
-    wraps = slice(int(of.tendon_adr[tendon]), int(of.tendon_adr[tendon] + of.tendon_num[tendon]))
-    if equality.name2 or list(of.wrap_type[wraps]) != [int(mujoco.mjtWrap.mjWRAP_JOINT)] * 2:
+    compiled = model.model
+    tendon = int(model.model.eq_obj1id[equality.id])
+    wraps = slice(int(compiled.tendon_adr[tendon]), int(compiled.tendon_adr[tendon] + compiled.tendon_num[tendon]))
+    if equality.name2 or list(compiled.wrap_type[wraps]) != [int(mujoco.mjtWrap.mjWRAP_JOINT)] * 2:
         return None
-    (master, follower), (a, b) = map(int, of.wrap_objid[wraps]), map(float, of.wrap_prm[wraps])
+    (master, follower), (a, b) = map(int, compiled.wrap_objid[wraps]), map(float, compiled.wrap_prm[wraps])
     if not b:
         return None
-    start, end = (float(of.qpos0[int(of.jnt_qposadr[joint])]) for joint in (master, follower))
+    start, end = (float(compiled.qpos0[int(compiled.jnt_qposadr[joint])]) for joint in (master, follower))
     return model.joints[follower], model.joints[master], -a / b, end + (float(equality.data[0]) + a * start) / b
 
 
@@ -543,9 +558,11 @@ def is_held(model: MjcfModel, equality: Any) -> bool:
 
 def loop_bodies(model: MjcfModel, equality: Any) -> tuple[int, int]:
     """Numbers of both bodies that a `connect` or `weld` keeps together."""
-    of, sites = model.model, equality.objtype.name == "mjOBJ_SITE"
-    one, other = int(of.eq_obj1id[equality.id]), int(of.eq_obj2id[equality.id])
-    return (int(of.site_bodyid[one]), int(of.site_bodyid[other])) if sites else (one, other)
+    compiled = model.model
+    sites = equality.objtype.name == "mjOBJ_SITE"
+    first = int(compiled.eq_obj1id[equality.id])
+    second = int(compiled.eq_obj2id[equality.id])
+    return (int(compiled.site_bodyid[first]), int(compiled.site_bodyid[second])) if sites else (first, second)
 
 
 def loop_frames(model: MjcfModel, equality: Any) -> tuple[Array, Array]:
@@ -554,11 +571,12 @@ def loop_frames(model: MjcfModel, equality: Any) -> tuple[Array, Array]:
     As `mj_instantiateEqual` has them: of bodies, the anchor of a connect in the first and in the second, and that of a
     weld in the second and in the first, with the second body's orientation in the first.
     """
-    of, data = model.model, model.model.eq_data[equality.id]
+    compiled = model.model
+    data = model.model.eq_data[equality.id]
     if equality.objtype.name == "mjOBJ_SITE":
-        sites = (int(x[equality.id]) for x in (of.eq_obj1id, of.eq_obj2id))
-        one, other = (pose(of.site_pos[site], of.site_quat[site]) for site in sites)
-        return one, other
+        sites = (int(x[equality.id]) for x in (compiled.eq_obj1id, compiled.eq_obj2id))
+        first, second = (pose(compiled.site_pos[site], compiled.site_quat[site]) for site in sites)
+        return first, second
     level = np.array([1.0, 0.0, 0.0, 0.0])
     if equality_kind(equality) == "connect":
         return pose(data[:3], level), pose(data[3:6], level)
@@ -567,15 +585,18 @@ def loop_frames(model: MjcfModel, equality: Any) -> tuple[Array, Array]:
 
 def driven_joints(model: MjcfModel) -> set[str] | None:
     """Names of the joints that actuators drive; None where some drive what is no joint, or there are none."""
-    of, driven, kinds = model.model, set[int](), mujoco.mjtTrn
-    for kind, (target, _) in zip(of.actuator_trntype, of.actuator_trnid, strict=True):
+    compiled = model.model
+    driven = set[int]()
+    kinds = mujoco.mjtTrn
+    for kind, (target, _) in zip(compiled.actuator_trntype, compiled.actuator_trnid, strict=True):
         if int(kind) in map(int, (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT)):
             driven.add(int(target))
         elif int(kind) == int(kinds.mjTRN_TENDON):
-            first, count = int(of.tendon_adr[target]), int(of.tendon_num[target])
-            if (of.wrap_type[first : first + count] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
+            first = int(compiled.tendon_adr[target])
+            count = int(compiled.tendon_num[target])
+            if (compiled.wrap_type[first : first + count] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
                 return None
-            driven.update(map(int, of.wrap_objid[first : first + count]))
+            driven.update(map(int, compiled.wrap_objid[first : first + count]))
         else:
             return None
     return {model.joints[joint] for joint in driven} or None
@@ -623,13 +644,15 @@ def urdf_document(path: Path) -> etree._ElementTree:
 
 class _Document:
     def __init__(self, model: MjcfModel) -> None:
-        self.model, self.root = model, etree.Element("robot", name=model.path.stem)
-        self._links, self._joints = set[str](), set(model.joints)
+        self.model = model
+        self.root = etree.Element("robot", name=model.path.stem)
+        self._links = set[str]()
+        self._joints = set(model.joints)
         members = [model.base, *(i for i in model.members if i != model.base)]
         self._taken = {model.bodies[i] for i in members}
         self._by_body = {body.id: body for body in model.spec.bodies}
         mimics = (mimic_of(model, equality) for equality in model.spec.equalities)
-        self._mimics = {found[0]: found[1:] for found in mimics if found is not None}
+        self._mimics = {mimic[0]: mimic[1:] for mimic in mimics if mimic is not None}
         for body in members:
             self._add_body(body)
         for body in members if model.base else members[1:]:
@@ -637,8 +660,10 @@ class _Document:
         self._add_loops()
 
     def _add_body(self, body: int) -> None:
-        model, name = self.model, self.model.bodies[body]
-        before, T = model.bodies[int(model.model.body_parentid[body])], model.pose(body)
+        model = self.model
+        name = self.model.bodies[body]
+        before = model.bodies[int(model.model.body_parentid[body])]
+        T = model.pose(body)
         joints = model.joints_of(body)
         for joint in joints:
             last = joint == joints[-1]
@@ -646,7 +671,8 @@ class _Document:
             if not last:
                 self._add_link(link)
             self._add_joint(joint, before, link, T)
-            before, T = link, np.eye(4)
+            before = link
+            T = np.eye(4)
         if body != model.base and not joints:
             self._weld(before, name, T)
         self._add_link(name, body if body else None)
@@ -654,21 +680,26 @@ class _Document:
     def _add_link(self, name: str, body: int | None = None) -> etree._Element:
         link = etree.SubElement(self.root, "link", name=name)
         if body is not None and self.model.model.body_mass[body] > 0.0:
-            of = self.model.model
+            compiled = self.model.model
             inertial = etree.SubElement(link, "inertial")
-            _add_origin(inertial, pose(of.body_ipos[body], of.body_iquat[body]))
-            etree.SubElement(inertial, "mass", value=repr(float(of.body_mass[body])))
-            numbers = np.diag(of.body_inertia[body])
+            _add_origin(inertial, pose(compiled.body_ipos[body], compiled.body_iquat[body]))
+            etree.SubElement(inertial, "mass", value=repr(float(compiled.body_mass[body])))
+            numbers = np.diag(compiled.body_inertia[body])
             names = {f"i{'xyz'[row]}{'xyz'[k]}": repr(float(numbers[row, k])) for row, k in INERTIA_AXES}
             etree.SubElement(inertial, "inertia", names)
         return link
 
     def _add_joint(self, joint: int, parent: str, child: str, T_parent_body: Array) -> None:
         """A joint about an anchor that may be off the body's origin, at position 0 in its frame."""
-        model, of = self.model, self.model.model
-        slides, dof, address = model.slides(joint), int(of.jnt_dofadr[joint]), int(of.jnt_qposadr[joint])
-        anchor, axis, reference = of.jnt_pos[joint], of.jnt_axis[joint], float(of.qpos0[address])
-        limited = bool(of.jnt_limited[joint])
+        model = self.model
+        compiled = self.model.model
+        slides = model.slides(joint)
+        dof = int(compiled.jnt_dofadr[joint])
+        address = int(compiled.jnt_qposadr[joint])
+        anchor = compiled.jnt_pos[joint]
+        axis = compiled.jnt_axis[joint]
+        reference = float(compiled.qpos0[address])
+        limited = bool(compiled.jnt_limited[joint])
         element = etree.SubElement(self.root, "joint", name=model.joints[joint])
         element.set("type", "prismatic" if slides else "revolute" if limited else "continuous")
         back = np.eye(4)
@@ -686,20 +717,21 @@ class _Document:
             link.set(f"{OWN}xyz", _text(-anchor))
         etree.SubElement(element, "axis", xyz=_text(axis))
         if limited:
-            low, high = map(float, of.jnt_range[joint])
+            low, high = map(float, compiled.jnt_range[joint])
             etree.SubElement(element, "limit", lower=repr(low), upper=repr(high), effort="0", velocity="0")
-        damping, friction = float(of.dof_damping[dof]), float(of.dof_frictionloss[dof])
+        damping = float(compiled.dof_damping[dof])
+        friction = float(compiled.dof_frictionloss[dof])
         dynamics = etree.SubElement(element, "dynamics", damping=repr(damping), friction=repr(friction))
-        own = {"armature": of.dof_armature[dof], "stiffness": of.jnt_stiffness[joint]}
-        if own["stiffness"]:
-            own["rest"] = of.qpos_spring[address]
-        for name, value in own.items():
+        beyond_urdf = {"armature": compiled.dof_armature[dof], "stiffness": compiled.jnt_stiffness[joint]}
+        if beyond_urdf["stiffness"]:
+            beyond_urdf["rest"] = compiled.qpos_spring[address]
+        for name, value in beyond_urdf.items():
             if value:
                 dynamics.set(OWN + name, repr(float(value)))
         if (mimic := self._mimics.get(model.joints[joint])) is not None:
             master, multiplier, offset = mimic
-            found = {"joint": master, "multiplier": repr(multiplier), "offset": repr(offset)}
-            etree.SubElement(element, "mimic", found)
+            attributes = {"joint": master, "multiplier": repr(multiplier), "offset": repr(offset)}
+            etree.SubElement(element, "mimic", attributes)
 
     def _weld(self, parent: str, child: str, T: Array) -> None:
         name = f"{child}_fixed"
@@ -713,17 +745,21 @@ class _Document:
 
     def _add_shapes(self, body: int) -> None:
         """Sites as links; geoms as shapes of the body's link, or of a link of their own if they have a name."""
-        model, of = self.model, self.model.model
+        model = self.model
+        compiled = self.model.model
         spec = self._by_body[body]
         for site in spec.sites:
             if site.name:
-                self._frame(body, site.name, "site", pose(of.site_pos[site.id], of.site_quat[site.id]))
+                self._frame(body, site.name, "site", pose(compiled.site_pos[site.id], compiled.site_quat[site.id]))
         for geom in spec.geoms:
-            T, collides = pose(of.geom_pos[geom.id], of.geom_quat[geom.id]), bool(geom.contype or geom.conaffinity)
-            link, origin = self.root.find(f"link[@name={_quoted(model.bodies[body])}]"), T
+            T = pose(compiled.geom_pos[geom.id], compiled.geom_quat[geom.id])
+            collides = bool(geom.contype or geom.conaffinity)
+            link = self.root.find(f"link[@name={_quoted(model.bodies[body])}]")
+            origin = T
             shape = self._shape(geom.id)
             if geom.name and collides and shape is not None:
-                link, origin = self._frame(body, geom.name, "geom", T), np.eye(4)
+                link = self._frame(body, geom.name, "geom", T)
+                origin = np.eye(4)
             if shape is not None and link is not None:
                 element = etree.SubElement(link, "collision" if collides else "visual")
                 _add_origin(element, origin if geom.id not in model.meshes else origin @ self._mesh_frame(geom.id))
@@ -733,7 +769,8 @@ class _Document:
         """Loops and what else holds the robot, with links for their frames, and which joints no motor drives."""
         model = self.model
         for number, held in enumerate((x for x in model.spec.equalities if is_held(model, x)), start=1):
-            name, poses = held.name or f"loop{number}", loop_frames(model, held)
+            name = held.name or f"loop{number}"
+            poses = loop_frames(model, held)
             links = [
                 str(self._frame(body, f"{name} of {model.bodies[body]}", "loop", T).get("name"))
                 for body, T in zip(loop_bodies(model, held), poses, strict=True)
@@ -761,15 +798,21 @@ class _Document:
 
     def _mesh_frame(self, geom: int) -> Array:
         """Pose of a mesh file's axes in the frame of its geom, which MuJoCo puts into the mesh's principal axes."""
-        of, mesh = self.model.model, int(self.model.model.geom_dataid[geom])
-        return np.eye(4) if mesh < 0 else np.asarray(np.linalg.inv(pose(of.mesh_pos[mesh], of.mesh_quat[mesh])))
+        compiled = self.model.model
+        mesh = int(self.model.model.geom_dataid[geom])
+        return (
+            np.eye(4)
+            if mesh < 0
+            else np.asarray(np.linalg.inv(pose(compiled.mesh_pos[mesh], compiled.mesh_quat[mesh])))
+        )
 
     def _shape(self, geom: int) -> etree._Element | None:
-        of, mesh = self.model.model, self.model.meshes.get(geom)
+        compiled = self.model.model
+        mesh = self.model.meshes.get(geom)
         if mesh is not None:
             return etree.Element("mesh", filename=mesh.file, scale=_text(mesh.scale))
         kind = _SHAPES.get(self.model.geom_kind(geom))
-        size = [float(x) for x in of.geom_size[geom]]
+        size = [float(x) for x in compiled.geom_size[geom]]
         if kind is None:
             return None
         if kind == "box":  # of an ellipsoid the one around it
@@ -796,7 +839,8 @@ def roll_pitch_yaw(R: Array) -> tuple[float, float, float]:
     Any yaw will do there, as long as the other two follow from it: they are those of Rz(-yaw) R.
     """
     yaw = float(np.arctan2(R[1, 0], R[0, 0]))
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     pitch = float(np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0]))
     roll = float(np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1]))
     return roll, pitch, yaw

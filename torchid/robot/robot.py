@@ -190,11 +190,11 @@ class Robot:
 
     def bodies_to(self, body: int) -> list[int]:
         """Bodies from the base on, without it, to one, which is the last."""
-        found = list[int]()
+        path = list[int]()
         while body > 0:
-            found.append(body)
+            path.append(body)
             body = self.bodies[body].parent
-        return found[::-1]
+        return path[::-1]
 
     @property
     def massless(self) -> tuple[str, ...]:
@@ -209,7 +209,8 @@ class Robot:
     @cached_property
     def joint_map(self) -> tuple[Array, Array]:
         """`(M, c)`, (L - 1, n) and (L - 1,): positions of all joints from the independent ones, `M q + c`."""
-        matrix, constant = np.zeros((len(self.bodies) - 1, self.n)), np.zeros(len(self.bodies) - 1)
+        matrix = np.zeros((len(self.bodies) - 1, self.n))
+        constant = np.zeros(len(self.bodies) - 1)
         for row, body in enumerate(self.bodies[1:]):
             joint = body.joint
             if joint is not None and joint.mimic is not None:
@@ -233,8 +234,10 @@ class Robot:
     def spring_torque(self) -> Array:
         """Torque (n,) [N m or N] that holds the joints at position 0 against their springs."""
         matrix, constant = self.joint_map
-        stiffness, rest = (np.array([getattr(x, name) for x in self._joints]) for name in ("stiffness", "rest"))
-        return matrix.T @ (stiffness * (constant - rest))
+        stiffness, rest_position = (
+            np.array([getattr(x, name) for x in self._joints]) for name in ("stiffness", "rest")
+        )
+        return matrix.T @ (stiffness * (constant - rest_position))
 
     @property
     def _joints(self) -> list[BodyJoint]:
@@ -316,8 +319,8 @@ def load_robot(
         if total_mass is not None and not any(link.inertial is not None and link.inertial.mass for link in links):
             spread_mass(path, links, joints, total_mass)
         if not fixed_base and has_fixed_base(path):
-            found = "none, so that its base is fixed to the world"
-            raise UrdfError(path, "<freejoint>", found, "robot.fixed_base: true, or a free joint of the base's body")
+            reason = "none, so that its base is fixed to the world"
+            raise UrdfError(path, "<freejoint>", reason, "robot.fixed_base: true, or a free joint of the base's body")
     welded = weld_positions(path, joints, weld if isinstance(weld, Mapping) else dict.fromkeys(weld, 0.0))
     by_name = {link.name: link for link in links}
     with during("reading", path):
@@ -333,7 +336,8 @@ def load_robot(
         kinds = {joint.name: joint.type for joint in joints if joint.name in welded}
         chain = build_chain(tree)
         moved = tuple(joint.child for joint in joints if joint.type in MOVING_TYPES and joint.child in carried)
-        held, closed = (welded, carried, moved, kinds), loops_of_file(path)
+        held = (welded, carried, moved, kinds)
+        closed = loops_of_file(path)
         robot = Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, chain, *held, base_tilt)
     validate_loops([*loops, *closed], robot.links)
     return replace(robot, loops=(*loops, *closed), passive=passive_joints(joints, passive, robot.joint_names))
@@ -405,17 +409,17 @@ def payload_parameters(robot: Robot, payloads: Sequence[Payload], recording: str
         UnknownNameError: the URDF has no such link.
         ConfigError: an inertia that no body has, or a link of a body that has none of its own.
     """
-    of = f" of {recording}" if recording else ""
+    where = f" of {recording}" if recording else ""
     added = np.zeros_like(robot.nominal)
     for payload in payloads:
-        body, T_body_link = robot.link(payload.link, f"payload.link{of}")
+        body, T_body_link = robot.link(payload.link, f"payload.link{where}")
         if parameters.consistency_margin(payload.about_center) < parameters.POSSIBLE_MARGIN:
-            found = f"{list(payload.inertia)}, which no body has"
-            raise ConfigError.at_field(f"payload.inertia{of}", found, INERTIA_ACCEPTED)
+            reason = f"{list(payload.inertia)}, which no body has"
+            raise ConfigError.at_field(f"payload.inertia{where}", reason, INERTIA_ACCEPTED)
         if robot.bodies[body].massless:
-            found = f"'{payload.link}', of a body without mass in the {robot.format}"
+            reason = f"'{payload.link}', of a body without mass in the {robot.format}"
             raise ConfigError.at_field(
-                f"payload.link{of}", found, "a link of a body with mass, or an <inertial> for it"
+                f"payload.link{where}", reason, "a link of a body with mass, or an <inertial> for it"
             )
         added[body, parameters.INERTIAL] += parameters.change_of_frame(T_body_link) @ payload.inertial
     return added.flatten()
@@ -481,11 +485,12 @@ def mirror_pairs(
     D["xyz".index(normal), "xyz".index(normal)] = -1.0
     out = []
     for i, j in pairs:
-        pair, accepted = f"{names[i]} and {names[j]}", "mirror images when all joints are at 0"
+        pair = f"{names[i]} and {names[j]}"
+        accepted = "mirror images when all joints are at 0"
         off = float(np.linalg.norm(D @ T[i, :3, 3] - T[j, :3, 3]))
         if off > MIRROR_TOLERANCE * size:
-            found = f"{pair} are {off:.3g} m from being mirror images along {normal} in a robot of {size:.3g} m"
-            raise ConfigError.at_field(field, found, f"{accepted}, to {MIRROR_TOLERANCE * size:.2g} m")
+            reason = f"{pair} are {off:.3g} m from being mirror images along {normal} in a robot of {size:.3g} m"
+            raise ConfigError.at_field(field, reason, f"{accepted}, to {MIRROR_TOLERANCE * size:.2g} m")
         aslant = _angle(robot, T, D, i, j)
         if aslant > MIRROR_TOLERANCE:
             raise ConfigError.at_field(field, f"the joints of {pair} are {aslant:.3g} rad off", accepted)
@@ -502,12 +507,12 @@ def _by_name(
     if left == right:
         raise ConfigError.at_field(field, f"'{left}' on both sides", "two different parts of names")
     images = {name: _images(name, left, right, names) for name in names}
-    for name, found in images.items():
+    for name, counterparts in images.items():
         expected = _exchanged(name, left, right)
-        if not found and name not in apart and expected != name:
+        if not counterparts and name not in apart and expected != name:
             raise ConfigError.at_field(field, f"{name} has no counterpart", f"a body named {expected}")
-        if len(found) > 1 or any(images[image] != [name] for image in found):
-            others = [other for other in names if other in found or name in images[other]]
+        if len(counterparts) > 1 or any(images[image] != [name] for image in counterparts):
+            others = [other for other in names if other in counterparts or name in images[other]]
             raise ConfigError.at_field(field, f"{name} corresponds to {' and to '.join(others)}", "one counterpart")
     pairs = [(i, names.index(images[name][0])) for i, name in enumerate(names) if images[name]]
     if not pairs:
@@ -522,13 +527,13 @@ def _images(name: str, left: str, right: str, names: tuple[str, ...]) -> list[st
     exchanged = _exchanged(name, left, right)
     if exchanged != name and exchanged in names:
         return [exchanged]
-    found = [
+    candidates = [
         name[:i] + other + name[i + len(token) :]
         for token, other in ((left, right), (right, left))
         for i in range(len(name))
         if name.startswith(token, i)
     ]
-    return [other for other in names if other in found]
+    return [other for other in names if other in candidates]
 
 
 def _exchanged(name: str, left: str, right: str) -> str:
@@ -543,10 +548,13 @@ def _exchanged(name: str, left: str, right: str) -> str:
 
 def _angle(robot: Robot, T: Array, D: Array, i: int, j: int) -> float:
     """Angle between the axis of body j's joint and the mirrored one of body i's [rad], pi if only one slides."""
-    one, other = robot.bodies[i].joint, robot.bodies[j].joint
-    if one is None or other is None:
+    body_joint = robot.bodies[i].joint
+    image_joint = robot.bodies[j].joint
+    if body_joint is None or image_joint is None:
         return 0.0
-    if one.kind != other.kind:
+    if body_joint.kind != image_joint.kind:
         return float(np.pi)
-    axes = [T[k, :3, :3] @ joint.T_joint_link[:3, :3].T @ joint.axis for k, joint in ((i, one), (j, other))]
+    axes = [
+        T[k, :3, :3] @ joint.T_joint_link[:3, :3].T @ joint.axis for k, joint in ((i, body_joint), (j, image_joint))
+    ]
     return float(np.arcsin(min(1.0, float(np.linalg.norm(np.cross(D @ axes[0], axes[1]))))))

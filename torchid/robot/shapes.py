@@ -82,10 +82,14 @@ def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[in
     inertials = {link.name: link.inertial for link in read_urdf(robot.path)[0]}
     chosen = [i for i, body in enumerate(robot.bodies) if not body.massless] if bodies is None else bodies
     extents: dict[int, Extent] = {}
-    shapeless, unreadable, reasons = [], [], []
+    shapeless = []
+    unreadable = []
+    reasons = []
     meshes = Meshes(robot.path)
     for index in chosen:
-        body, shapes, inertia_boxes = robot.bodies[index], [], []
+        body = robot.bodies[index]
+        shapes = []
+        inertia_boxes = []
         try:
             for name in body.links:
                 T_body_link = robot.links[name][1]
@@ -132,13 +136,15 @@ def read_shape(meshes: Meshes, field: str, element: etree._Element) -> Shape:
     geometry = element.find("geometry")
     tags = [] if geometry is None else [child for child in geometry if isinstance(child.tag, str)]  # and no comments
     if len(tags) != 1 or tags[0].tag not in SHAPE_TAGS:
-        found = ", ".join(f"<{child.tag!s}>" for child in tags) or "no shape"
-        raise UrdfError(path, f"{field} <geometry>", found, f"one of {', '.join(SHAPE_TAGS)}")
+        reason = ", ".join(f"<{child.tag!s}>" for child in tags) or "no shape"
+        raise UrdfError(path, f"{field} <geometry>", reason, f"one of {', '.join(SHAPE_TAGS)}")
     points, spread = _points_and_spread(meshes, f"{field} <{tags[0].tag!s}", tags[0])
-    origin, T = element.find("origin"), np.eye(4)
+    origin = element.find("origin")
+    T = np.eye(4)
     if origin is not None:
         rpy, xyz = (read_numbers(path, f"{field} <origin", origin, name, 3, "0 0 0") for name in ("rpy", "xyz"))
-        T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", rpy).as_matrix(), xyz
+        T[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
+        T[:3, 3] = xyz
     return Shape(points, spread, np.eye(3)).moved(T)
 
 
@@ -170,15 +176,16 @@ def read_numbers(path: Path, field: str, element: etree._Element, name: str, cou
     signed = name in ("xyz", "rpy", "scale")
     fits = values.shape == (count,) and np.isfinite(values).all() and np.abs(values).max() <= MAX_NUMBER
     if not fits or not (signed or (values >= 0.0).all()):
-        found = f"'{excerpt(text)}'" if text else "none"
+        reason = f"'{excerpt(text)}'" if text else "none"
         accepted = f"{count} decimal number{'s' if count > 1 else ''}{'' if signed else ' of at least 0'}"
-        raise UrdfError(path, f"{field} {name}>", found, accepted)
+        raise UrdfError(path, f"{field} {name}>", reason, accepted)
     return values
 
 
 def _inertia_box(inertial: Inertial) -> Shape:
     """The uniform box that has a link's inertia."""
-    inertia, T = np.asarray(inertial.inertia), np.eye(4) if inertial.origin is None else inertial.origin
+    inertia = np.asarray(inertial.inertia)
+    T = np.eye(4) if inertial.origin is None else inertial.origin
     spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / inertial.mass
     values, axes = np.linalg.eigh(spread)
     corners = _CORNERS * np.sqrt(3.0 * np.maximum(values, 0.0))
@@ -187,7 +194,8 @@ def _inertia_box(inertial: Inertial) -> Shape:
 
 def _extent(shapes: list[Shape]) -> Extent | None:
     """Extent of one body's shapes; None if they are a single point."""
-    points, spreads = np.concatenate([shape.points for shape in shapes]), np.stack([shape.spread for shape in shapes])
+    points = np.concatenate([shape.points for shape in shapes])
+    spreads = np.stack([shape.spread for shape in shapes])
     of_point = np.repeat(np.arange(len(shapes)), [len(shape.points) for shape in shapes])
     tried = 1 + min(len(shapes), max(1, MAX_AXES // len(points)))
     candidates = (np.eye(3), *(shape.axes for shape in shapes))[:tried]
@@ -215,9 +223,11 @@ def _box(points: Array, spreads: Array, of_point: np.ndarray, axes: Array) -> tu
         axes: (3, 3), columns.
     """
     spread_along = np.linalg.norm(np.swapaxes(spreads, 1, 2) @ axes, axis=1)
-    top, bottom = np.full(3, -np.inf), np.full(3, np.inf)
+    top = np.full(3, -np.inf)
+    bottom = np.full(3, np.inf)
     for part in (slice(k, k + _PART) for k in range(0, len(points), _PART)):
-        position, margin = points[part] @ axes, spread_along[of_point[part]]
+        position = points[part] @ axes
+        margin = spread_along[of_point[part]]
         top = np.maximum(top, (position + margin).max(axis=0))
         bottom = np.minimum(bottom, (position - margin).min(axis=0))
     return axes @ (top + bottom) / 2.0, (top - bottom) / 2.0
@@ -247,13 +257,16 @@ def _largest_norm(points: Array, spread: Array) -> float:
     return reach
 
 
-_MAX_OFFSET_M, _MAX_OFFSET_SHARE = 1e-3, 0.1
+_MAX_OFFSET_M = 1e-3
+_MAX_OFFSET_SHARE = 0.1
 """Distance of a cylinder's axis or a wheel's centre from the frame's origin up to which it is about it: either."""
 _MAX_ANGLE = 0.02  # rad, between a cylinder and the axis of its contact or joint
 _END_SHARES = (0.5, 0.3, 0.2, 0.1)  # of a mesh's length, the end that may be a ball; the first that is one counts
 _MAX_MISFIT_SHARE = 0.05  # of the radius, rms and at the lowest point; the end of Go2's foot misses a ball by 0.036
 _MIN_DEPTH_SHARE = 0.15  # of the radius: less of a ball is a sole, and a foot that turns by 30 degrees leaves it
-_MAX_BREADTH_SHARE, _FEWEST_CORNERS = 1.1, 8  # diameter over the mesh's longest edge; corners of the end
+# diameter over the mesh's longest edge; corners of the end
+_MAX_BREADTH_SHARE = 1.1
+_FEWEST_CORNERS = 8
 
 
 @dataclass(frozen=True)
@@ -275,7 +288,8 @@ class CollisionShapes:
 
     def __init__(self, robot: Robot) -> None:
         """Read the URDF, whose other shapes do not matter here."""
-        self.robot, self._meshes = robot, Meshes(robot.path)
+        self.robot = robot
+        self._meshes = Meshes(robot.path)
         self._links = {link.get("name"): link for link in parse_xml(robot.path).getroot().findall("link")}
 
     def about(self, frame: str, axis: str | None = None, meshes: bool = True) -> RollingShape | None:
@@ -296,7 +310,8 @@ class CollisionShapes:
             UrdfError: a shape that is not described by numbers.
         """
         body, T_body_frame = self.robot.link(frame)
-        T_frame_body, joint = np.linalg.inv(T_body_frame), self.robot.bodies[body].joint
+        T_frame_body = np.linalg.inv(T_body_frame)
+        joint = self.robot.bodies[body].joint
         if axis is not None:
             along = np.eye(3)["xyz".index(axis)]
             return _choose(self._all(frame, "cylinder", lambda shape: _cylinder(shape, along, slides=True)), frame)
@@ -316,7 +331,7 @@ class CollisionShapes:
     def _all(self, frame: str, kind: str, measure: Callable[[Shape], tuple[Array, float] | None]) -> list[RollingShape]:
         """What rolls among shapes of a kind; `measure`: centre (3,) and radius [m] of one in the frame, or None."""
         body, T_body_frame = self.robot.link(frame)
-        found = []
+        shapes = []
         for link in sorted(self.robot.bodies[body].links, key=lambda name: name != frame):
             T_frame_link = np.linalg.inv(T_body_frame) @ self.robot.links[link][1]
             for element in self._links[link].findall("collision"):
@@ -327,22 +342,24 @@ class CollisionShapes:
                     if (measured := measure(shape)) is not None and measured[1] > 0.0:
                         x, y, z = measured[0].tolist()
                         file = PurePosixPath(str(tag.get("filename", ""))).name
-                        found.append(RollingShape(kind, measured[1], link, (x, y, z), file))
-        return found
+                        shapes.append(RollingShape(kind, measured[1], link, (x, y, z), file))
+        return shapes
 
 
-def _choose(found: list[RollingShape], frame: str) -> RollingShape | None:
+def _choose(shapes: list[RollingShape], frame: str) -> RollingShape | None:
     """Of shapes that the frame's origin lies in the largest, of its own link first; else its own link's only one."""
-    own = [shape for shape in found if shape.link == frame]
-    for some in (own, found):
-        if around := [shape for shape in some if np.linalg.norm(shape.centre) <= shape.radius]:
+    on_link = [shape for shape in shapes if shape.link == frame]
+    for group in (on_link, shapes):
+        if around := [shape for shape in group if np.linalg.norm(shape.centre) <= shape.radius]:
             return max(around, key=lambda shape: shape.radius)
-    return own[0] if len(own) == 1 else None
+    return on_link[0] if len(on_link) == 1 else None
 
 
 def _cylinder(shape: Shape, along: Array, slides: bool) -> tuple[Array, float] | None:
     """Origin and radius of a cylinder about the origin along a unit vector (3,), anywhere along it if it `slides`."""
-    axis, centre, radius = shape.axes[:, 2], shape.points.mean(axis=0), float(np.linalg.norm(shape.spread, 2))
+    axis = shape.axes[:, 2]
+    centre = shape.points.mean(axis=0)
+    radius = float(np.linalg.norm(shape.spread, 2))
     if slides:  # a line is as long as its contact; a wheel, narrow, stands on its middle
         centre = centre - axis * (axis @ centre)
     is_about = np.linalg.norm(centre) <= max(_MAX_OFFSET_M, _MAX_OFFSET_SHARE * radius)
@@ -358,7 +375,8 @@ def fit_end(points: Array, hinge: Array) -> tuple[Array, float] | None:
     """
     away = points.mean(axis=0) - hinge
     away /= max(float(np.linalg.norm(away)), np.finfo(float).tiny)
-    depth, longest = points @ away, np.ptp(points, axis=0).max()
+    depth = points @ away
+    longest = np.ptp(points, axis=0).max()
     for share in _END_SHARES:
         end = np.unique(points[depth >= depth.max() - share * np.ptp(depth)], axis=0)
         if len(end) < _FEWEST_CORNERS:

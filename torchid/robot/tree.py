@@ -97,10 +97,10 @@ def build_tree(
     mimics = resolve_mimics(path, joints)
     locked = {name for name, mimic in mimics.items() if not mimic.master}
     neighbours: dict[str, list[tuple[TreeJoint, bool]]] = {name: [] for name in names}
-    for one in joints:  # children before parents, each in the URDF's order
-        neighbours[one.parent].append((one, False))
-    for one in joints:
-        neighbours[one.child].append((one, True))
+    for edge in joints:  # children before parents, each in the URDF's order
+        neighbours[edge.parent].append((edge, False))
+    for edge in joints:
+        neighbours[edge.child].append((edge, True))
 
     tree = BodyTree([], [], {})
     stack: list[tuple[str, TreeJoint | None, bool]] = [(base_link, None, False)]
@@ -138,11 +138,12 @@ def _find_root(path: Path, links: list[Link], joints: list[TreeJoint]) -> str:
     parent: dict[str, str] = {}
     for joint in joints:
         if joint.child in parent:
-            found = f"child of joint '{joint.name}' and of another joint"
-            raise UrdfError(path, f"link '{joint.child}'", found, "one parent for each link: a tree without loops")
+            reason = f"child of joint '{joint.name}' and of another joint"
+            raise UrdfError(path, f"link '{joint.child}'", reason, "one parent for each link: a tree without loops")
         parent[joint.child] = joint.parent
     roots = [link.name for link in links if link.name not in parent]
-    reached, queue = set(roots[:1]), list(roots[:1])
+    reached = set(roots[:1])
+    queue = list(roots[:1])
     children: dict[str, list[str]] = {}
     for child, parent_name in parent.items():
         children.setdefault(parent_name, []).append(child)
@@ -167,7 +168,10 @@ def resolve_mimics(path: Path, joints: Sequence[TreeJoint]) -> dict[str, Mimic]:
     for joint in joints:
         if joint.mimic is None or joint.type not in MOVING_TYPES:
             continue
-        multiplier, offset, master, visited = 1.0, 0.0, joint, {joint.name}
+        multiplier = 1.0
+        offset = 0.0
+        master = joint
+        visited = {joint.name}
         while master.mimic is not None and master.type in MOVING_TYPES:
             offset += multiplier * master.mimic.offset
             multiplier *= master.mimic.multiplier
@@ -179,8 +183,8 @@ def resolve_mimics(path: Path, joints: Sequence[TreeJoint]) -> dict[str, Mimic]:
             visited.add(master.name)
         _check_mimic_size(path, joint.name, multiplier, offset)
         if master.type not in MOVING_TYPES:
-            found = f"its mimic master '{master.name}' is fixed, so that it is fixed too"
-            warn(f"{path}: joint '{joint.name}': {found}")
+            reason = f"its mimic master '{master.name}' is fixed, so that it is fixed too"
+            warn(f"{path}: joint '{joint.name}': {reason}")
         resolved[joint.name] = Mimic(master.name if master.type in MOVING_TYPES else "", multiplier, offset)
     return resolved
 
@@ -188,8 +192,8 @@ def resolve_mimics(path: Path, joints: Sequence[TreeJoint]) -> dict[str, Mimic]:
 def _check_mimic_size(path: Path, joint: str, multiplier: float, offset: float) -> None:
     """Bound the product of a chain's ratios; `read_urdf` bounds each of them."""
     if not max(abs(multiplier), abs(offset)) <= MAX_NUMBER:
-        found = f"multiplier {multiplier:g} and offset {offset:g} along its chain"
-        raise UrdfError(path, f"joint '{joint}', <mimic>", found, f"at most {MAX_NUMBER:g}")
+        reason = f"multiplier {multiplier:g} and offset {offset:g} along its chain"
+        raise UrdfError(path, f"joint '{joint}', <mimic>", reason, f"at most {MAX_NUMBER:g}")
 
 
 def _start_body(tree: BodyTree, name: str, joint: BodyJoint | None) -> None:
@@ -247,7 +251,8 @@ def _locked_pose(joint: TreeJoint, reverse: bool, mimics: dict[str, Mimic]) -> A
 
 def joint_transform(joint: TreeJoint, position: float) -> Array:
     """Pose of the child link in a joint's frame at a position [rad or m], (4, 4)."""
-    axis, T = joint.axis / np.linalg.norm(joint.axis), np.eye(4)
+    axis = joint.axis / np.linalg.norm(joint.axis)
+    T = np.eye(4)
     if joint.type == "prismatic":
         T[:3, 3] = position * axis
     else:
@@ -424,15 +429,15 @@ def weld_positions(path: Path, joints: Sequence[TreeJoint], weld: Mapping[str, f
     mimics = {name: mimic for name, mimic in resolve_mimics(path, joints).items() if mimic.master}
     for name, (key, _) in stated.items():
         if name in mimics and mimics[name].master not in stated:
-            found = f"joint '{name}', which follows '{mimics[name].master}', which moves"
-            raise ConfigError.at_field(_field(key), found, "its master too")
+            reason = f"joint '{name}', which follows '{mimics[name].master}', which moves"
+            raise ConfigError.at_field(_field(key), reason, "its master too")
     limits = position_limits(path)
     for name, (key, position) in stated.items():
         low, high = limits.get(name, (-np.inf, np.inf))
         if name not in mimics and not low - _POSITION_ROUNDING <= position <= high + _POSITION_ROUNDING:
-            found = f"{position:g}, outside of the limits of joint '{name}'"
+            reason = f"{position:g}, outside of the limits of joint '{name}'"
             accepted = f"a position from {low:g} to {high:g}: weld: {{'{name}': {(low + high) / 2:.4g}}}"
-            raise ConfigError.at_field(_field(key), found, accepted)
+            raise ConfigError.at_field(_field(key), reason, accepted)
     welded = {}
     for name in moving:
         mimic = mimics.get(name)
@@ -449,13 +454,14 @@ def _stated(
     joints: Sequence[TreeJoint], moving: Mapping[str, TreeJoint], weld: Mapping[str, float]
 ) -> dict[str, tuple[str, float]]:
     """Name or pattern and position by name of joint."""
-    names, stated = [joint.name for joint in joints], dict[str, tuple[str, float]]()
+    names = [joint.name for joint in joints]
+    stated = dict[str, tuple[str, float]]()
     for key, position in weld.items():
         for name in matching_joints(WELD_FIELD, key, moving, names):
             other, before = stated.setdefault(name, (key, position))
             if before != position:
-                found = f"{position:g} for joint '{name}', which '{other}' holds at {before:g}"
-                raise ConfigError.at_field(_field(key), found, "one position for a joint")
+                reason = f"{position:g} for joint '{name}', which '{other}' holds at {before:g}"
+                raise ConfigError.at_field(_field(key), reason, "one position for a joint")
     return stated
 
 
@@ -472,7 +478,8 @@ def matching_joints(field: str, key: str, moving: Iterable[str], names: Iterable
         UnknownNameError: a name that is none of them.
         ConfigError: a pattern that matches none.
     """
-    pattern, moving = any(sign in key for sign in "*?"), list(moving)
+    pattern = any(sign in key for sign in "*?")
+    moving = list(moving)
     matches = [name for name in moving if (fnmatchcase(name, key) if pattern else name == key)]
     if not matches and pattern:
         raise ConfigError.at_field(field, f"'{key}' matches no joint that moves", f"among {join_names(moving)}")
@@ -508,7 +515,8 @@ def links_beyond(
         heads: names of the bodies.
     """
     welded = set(welded)
-    near, reached = dict[str, list[str]](), set(heads)
+    near = dict[str, list[str]]()
+    reached = set(heads)
     for joint in joints:
         if joint.name not in welded and body_of[joint.parent] == body_of[joint.child]:
             near.setdefault(joint.parent, []).append(joint.child)
@@ -521,8 +529,10 @@ def links_beyond(
     return [name for name in body_of if name not in reached]
 
 
-LOOPS_FIELD, PASSIVE_FIELD = "robot.loops", "robot.passive"
-MAX_GAP, MAX_ANGLE = 0.005, 0.05
+LOOPS_FIELD = "robot.loops"
+PASSIVE_FIELD = "robot.passive"
+MAX_GAP = 0.005
+MAX_ANGLE = 0.05
 """Rms distance [m] and angle [rad] over a log up to which a loop counts as closed, unless it states its own."""
 
 
@@ -558,12 +568,14 @@ def loops_of_file(path: Path) -> tuple[Loop, ...]:
         TorchidWarning: some hold the robot to what is no part of it, as a mocap body: contacts, if they are named.
     """
     root = parse_xml(path).getroot()
-    for one in root.findall(f"{OWN}attachment"):
+    for attachment in root.findall(f"{OWN}attachment"):
         held = "holds the robot to what is no part of it, by a force that is left out"
-        contact = f"{{frame: {one.get('frame')}, type: {'point' if one.get('type') == 'point' else 'flat'}}}"
-        warn(f"{path}: {one.get('where')}: {held}; where it acted in a log: contacts: [{contact}]")
-    found = root.findall(f"{OWN}loop")
-    return tuple(Loop((str(x.get("one")), str(x.get("other"))), str(x.get("type"))) for x in found)
+        contact = (
+            f"{{frame: {attachment.get('frame')}, type: {'point' if attachment.get('type') == 'point' else 'flat'}}}"
+        )
+        warn(f"{path}: {attachment.get('where')}: {held}; where it acted in a log: contacts: [{contact}]")
+    loops = root.findall(f"{OWN}loop")
+    return tuple(Loop((str(x.get("one")), str(x.get("other"))), str(x.get("type"))) for x in loops)
 
 
 def validate_loops(loops: Sequence[Loop], links: Mapping[str, tuple[int, Array]]) -> None:
@@ -582,10 +594,10 @@ def validate_loops(loops: Sequence[Loop], links: Mapping[str, tuple[int, Array]]
         for frame in loop.frames:
             if frame not in links:
                 raise UnknownNameError.at_field(field, frame, links)
-        one, other = loop.frames
-        if links[one][0] == links[other][0]:
-            found = f"{one} and {other}, frames of one body, which no joint moves"
-            raise ConfigError.at_field(field, found, "frames of two bodies that joints move relative to each other")
+        first, second = loop.frames
+        if links[first][0] == links[second][0]:
+            reason = f"{first} and {second}, frames of one body, which no joint moves"
+            raise ConfigError.at_field(field, reason, "frames of two bodies that joints move relative to each other")
 
 
 def passive_joints(joints: Sequence[TreeJoint], names: Sequence[str] | None, moving: Iterable[str]) -> tuple[str, ...]:

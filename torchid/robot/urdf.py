@@ -102,11 +102,15 @@ def _tree_joint(joint: Joint, element: etree._Element) -> TreeJoint:
     if joint.dynamics is not None:  # left as text by yourdfpy
         joint.dynamics.damping = float(joint.dynamics.damping or 0.0)
         joint.dynamics.friction = float(joint.dynamics.friction or 0.0)
-    child, dynamics = element.find("child"), element.find("dynamics")
-    offset, of = "0 0 0" if child is None else child.get(f"{OWN}xyz", "0 0 0"), getattr(dynamics, "attrib", {})
-    own: dict[str, Any] = {name: float(of.get(OWN + name, 0.0)) for name in ("armature", "stiffness", "rest")}
-    own |= {"child_offset": tuple(map(float, offset.split())), "passive": OWN + "passive" in of}
-    return TreeJoint(**vars(joint), **own)
+    child = element.find("child")
+    dynamics = element.find("dynamics")
+    offset = "0 0 0" if child is None else child.get(f"{OWN}xyz", "0 0 0")
+    attributes = getattr(dynamics, "attrib", {})
+    beyond_urdf: dict[str, Any] = {
+        name: float(attributes.get(OWN + name, 0.0)) for name in ("armature", "stiffness", "rest")
+    }
+    beyond_urdf |= {"child_offset": tuple(map(float, offset.split())), "passive": OWN + "passive" in attributes}
+    return TreeJoint(**vars(joint), **beyond_urdf)
 
 
 def read_urdf(path: Path) -> tuple[list[Link], list[TreeJoint]]:
@@ -160,8 +164,8 @@ def _refuse_xacro(path: Path, root: etree._Element) -> None:
     for element in root.iter(etree.Element):
         name = f"{element.prefix}:{etree.QName(element).localname}" if element.prefix else str(element.tag)
         if name.startswith("xacro:"):
-            found = f"xacro that is not expanded, in line {element.sourceline}"
-            raise UrdfError(path, f"<{excerpt(name)}>", found, "the URDF that `xacro FILE.urdf.xacro` prints")
+            reason = f"xacro that is not expanded, in line {element.sourceline}"
+            raise UrdfError(path, f"<{excerpt(name)}>", reason, "the URDF that `xacro FILE.urdf.xacro` prints")
 
 
 def _check_names(path: Path, root: etree._Element) -> None:
@@ -187,19 +191,20 @@ def _check_name(path: Path, field: str, name: str) -> None:
 
 def _check_numbers(path: Path, owner: etree._Element) -> None:
     """Refuse attributes that are not decimal numbers; yourdfpy's error would not name the element."""
-    of = f"{owner.tag!s} '{owner.get('name')}'"
+    label = f"{owner.tag!s} '{owner.get('name')}'"
     for part in owner:
         for element in part.iter():
             for name, text in element.attrib.items():
-                count, text = _NUMBERS.get(str(name), 0), str(text)
+                count = _NUMBERS.get(str(name), 0)
+                text = str(text)
                 if not count:
                     continue
                 words = text.split()
                 if len(words) != count or not all(_DECIMAL.fullmatch(word) for word in words):
                     hint = " (expand xacro first)" if "${" in text else ""
                     accepted = f"{count} decimal number{'s' if count > 1 else ''}{hint}"
-                    raise UrdfError(path, f"{of}, <{element.tag!s} {name!s}>", f"'{excerpt(text)}'", accepted)
-                _check_size(path, f"{of}, <{part.tag!s}>", [float(word) for word in words])
+                    raise UrdfError(path, f"{label}, <{element.tag!s} {name!s}>", f"'{excerpt(text)}'", accepted)
+                _check_size(path, f"{label}, <{part.tag!s}>", [float(word) for word in words])
 
 
 def _check_size(path: Path, field: str, numbers: list[float]) -> None:
@@ -211,10 +216,11 @@ def _check_size(path: Path, field: str, numbers: list[float]) -> None:
 
 
 def _check_joint(path: Path, joint: etree._Element, links: list[str], joints: list[str]) -> None:
-    field, kind = f"joint '{joint.get('name')}'", joint.get("type")
+    field = f"joint '{joint.get('name')}'"
+    kind = joint.get("type")
     if kind not in JOINT_TYPES:
-        found = "no type" if kind is None else f"type '{excerpt(kind)}'"
-        raise UrdfError(path, field, found, ", ".join(JOINT_TYPES))
+        reason = "no type" if kind is None else f"type '{excerpt(kind)}'"
+        raise UrdfError(path, field, reason, ", ".join(JOINT_TYPES))
     for end in ("parent", "child"):
         element = joint.find(end)
         name = None if element is None else element.get("link")
@@ -236,7 +242,8 @@ def _check_link(path: Path, link: etree._Element) -> None:
     if inertial is None:
         return
     field = f"link '{link.get('name')}', <inertial>"
-    mass, inertia = inertial.find("mass"), inertial.find("inertia")
+    mass = inertial.find("mass")
+    inertia = inertial.find("inertia")
     if mass is None or mass.get("value") is None:
         raise UrdfError(path, field, "no <mass value=...>", "a mass [kg], or no <inertial> at all")
     missing = _INERTIA_ATTRIBUTES if inertia is None else [a for a in _INERTIA_ATTRIBUTES if inertia.get(a) is None]
@@ -266,8 +273,8 @@ def position_limits(path: Path) -> dict[str, tuple[float, float]]:
             continue
         low, high = (str(limit.get(name, "0")).strip() for name in ("lower", "upper"))
         if not (_DECIMAL.fullmatch(low) and _DECIMAL.fullmatch(high)):
-            found = f"'{excerpt(low)}' to '{excerpt(high)}'"
-            raise UrdfError(path, f"joint '{joint.get('name')}', <limit>", found, "decimal numbers")
+            reason = f"'{excerpt(low)}' to '{excerpt(high)}'"
+            raise UrdfError(path, f"joint '{joint.get('name')}', <limit>", reason, "decimal numbers")
         if float(low) < float(high):
             limits[str(joint.get("name"))] = (float(low), float(high))
     return limits
@@ -282,7 +289,7 @@ def _check_values(path: Path, links: list[Link], joints: list[Joint]) -> None:
     for joint in joints:
         field = f"joint '{joint.name}'"
         if joint.dynamics is not None and min(joint.dynamics.damping, joint.dynamics.friction) < 0.0:
-            found = f"damping {joint.dynamics.damping:g}, friction {joint.dynamics.friction:g}"
-            raise UrdfError(path, f"{field}, <dynamics>", found, "numbers of at least 0")
+            reason = f"damping {joint.dynamics.damping:g}, friction {joint.dynamics.friction:g}"
+            raise UrdfError(path, f"{field}, <dynamics>", reason, "numbers of at least 0")
         if joint.type in MOVING_TYPES and not np.linalg.norm(joint.axis) > 0.0:
             raise UrdfError(path, f"{field}, <axis>", f"'{joint.axis}'", "three numbers, not all zero")

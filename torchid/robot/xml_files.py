@@ -47,8 +47,8 @@ def read_xml(path: Path, root: str | None = None) -> etree._ElementTree:
     try:
         tree = _parse(content)
     except (etree.XMLSyntaxError, ValueError, LookupError) as error:
-        found = excerpt(getattr(error, "msg", None) or str(error), 200)
-        raise UrdfError(path, "XML", f"not well-formed: {found}", f"a well-formed {kind}") from error
+        reason = excerpt(getattr(error, "msg", None) or str(error), 200)
+        raise UrdfError(path, "XML", f"not well-formed: {reason}", f"a well-formed {kind}") from error
     tag = str(tree.getroot().tag)
     if root != "" and tag not in ([root] if root else ROOTS):
         raise UrdfError(path, "XML root", f"<{excerpt(tag)}>", f"<{root}>" if root else "<robot>, or <mujoco> of MJCF")
@@ -60,7 +60,7 @@ def _parse(content: bytes) -> etree._ElementTree:
     try:
         return etree.parse(io.BytesIO(content), parser)
     except etree.XMLSyntaxError:
-        if any(one.type != etree.ErrorTypes.NS_ERR_UNDEFINED_NAMESPACE for one in parser.error_log):
+        if any(error.type != etree.ErrorTypes.NS_ERR_UNDEFINED_NAMESPACE for error in parser.error_log):
             raise
     return etree.parse(io.BytesIO(content), etree.XMLParser(resolve_entities=False, no_network=True, recover=True))
 
@@ -98,7 +98,8 @@ def plain_urdf(root: etree._Element) -> None:
         child = joint.find("child")
         offset = None if child is None else child.attrib.pop(f"{OWN}xyz", None)
         if child is not None and offset is not None:
-            name, link = f"{joint.get('name')}_anchor", str(child.get("link"))
+            name = f"{joint.get('name')}_anchor"
+            link = str(child.get("link"))
             if name in names:
                 raise UrdfError("", f"joint '{joint.get('name')}'", f"a link or joint '{name}'", "another name")
             child.set("link", name)

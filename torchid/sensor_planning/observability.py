@@ -111,13 +111,14 @@ def candidates(
 
 def _at_contacts(contacts: Sequence[Contact], per: str, normal_forces: Sequence[str]) -> list[Candidate]:
     """Sensors of contacts, as devices or axis by axis, and scalar ones."""
-    frames, offered = [contact.frame for contact in contacts], []
+    frames = [contact.frame for contact in contacts]
+    offered = []
     for name in normal_forces:
         if name not in frames:
             raise UnknownNameError("sensors", "candidates.normal_forces", name, frames)
     if normal_forces and per == "axis":
-        found = f"{', '.join(normal_forces)}, beside single axes of the contacts' frames"
-        raise SensorError("sensors", "candidates.normal_forces", found, "candidates.contacts: device or none")
+        reason = f"{', '.join(normal_forces)}, beside single axes of the contacts' frames"
+        raise SensorError("sensors", "candidates.normal_forces", reason, "candidates.contacts: device or none")
     for index, contact in enumerate(contacts):
         if per == "device":
             components = tuple(contact.components)
@@ -175,7 +176,8 @@ def sensor_set(
     robot: Robot, contacts: Sequence[Contact], chosen: Iterable[Candidate], noise: SensorNoise | None = None
 ) -> SensorSet:
     """The sensor set that consists of some candidates; torques of joints without a motor are known."""
-    torque, wrench = robot.is_passive.copy(), np.zeros((len(contacts), 6), dtype=bool)
+    torque = robot.is_passive.copy()
+    wrench = np.zeros((len(contacts), 6), dtype=bool)
     for candidate in chosen:
         torque[list(candidate.dofs)] = True
         if candidate.contact is not None:
@@ -294,8 +296,8 @@ def _jacobian(builder: RowBuilder, posture: Samples, robot: Robot) -> Array:
     by_motors = builder.motors.of(builder.tree, builder.kinematics(posture), J)[:, :, 0].numpy()
     by_motors[..., [robot.base_rows + dof for dof in builder.motors.passive]] = 0.0
     if np.isnan(by_motors).any():
-        found = "loops in which motors do not determine how the other joints move"
-        raise UrdfError(robot.path, LOOPS_FIELD, found, "as many motors as a loop has motions, to plan sensors")
+        reason = "loops in which motors do not determine how the other joints move"
+        raise UrdfError(robot.path, LOOPS_FIELD, reason, "as many motors as a loop has motions, to plan sensors")
     return np.asarray(by_motors)
 
 
@@ -435,7 +437,8 @@ def assess_sensors(
     choice = [
         c for c in choice if c.kind != "normal_force" or (c.contact is not None and contacts[c.contact].along_normal)
     ]
-    builder, postures = RowBuilder(robot, contacts, sensors), postures or {}
+    builder = RowBuilder(robot, contacts, sensors)
+    postures = postures or {}
     drawn = random_postures(robot, samples, np.random.default_rng(seed))
     channels = candidates(robot, contacts, per="axis", ft_sensors=robot.ft_names)
     everything = tuple(dict.fromkeys((*channels, *choice)))
@@ -508,11 +511,13 @@ def describe_wrench(wrench: Array) -> str:
     (0, 0.1, 0)" [m]; and "with 0.2 m of pitch" [m = N m per N] if a moment about the same line comes with it.
     """
     wrench = wrench / np.linalg.norm(wrench)
-    force, moment = wrench[:3], wrench[3:]
+    force = wrench[:3]
+    moment = wrench[3:]
     size = float(np.linalg.norm(force))
     if size < _ZERO:
         return f"moment about {_vector(_signed(moment))}"
-    through, pitch = np.cross(force, moment) / size**2, float(force @ moment) / size**2
+    through = np.cross(force, moment) / size**2
+    pitch = float(force @ moment) / size**2
     text = f"force along {_vector(_signed(force))}"
     if np.linalg.norm(through) > _NEGLIGIBLE:
         text += f" through {_vector(through)}"
@@ -542,8 +547,10 @@ def _assess_state(
     builder: RowBuilder, state: ContactState, drawn: Array, recorded: Array | None, state_demands: _StateDemands
 ) -> BaseObservability:
     zero = np.zeros((1, drawn.shape[1]))
-    generic, straight = base_values(builder, state, drawn), base_values(builder, state, zero)
-    ranks, lost = base_rank(generic), None
+    generic = base_values(builder, state, drawn)
+    straight = base_values(builder, state, zero)
+    ranks = base_rank(generic)
+    lost = None
     if ranks.max() < 6:
         regular = zero if base_rank(straight)[0] == ranks.max() else drawn[[int(ranks.argmax())]]
         lost = _lost_base(builder, state, regular, state_demands)

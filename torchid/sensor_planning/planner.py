@@ -66,7 +66,9 @@ class MotionStack:
         seed: int = 0,
     ) -> None:
         """Draw samples of every contact state, the same for all sets."""
-        self.robot, self.contacts, self.states = robot, tuple(contacts), tuple(states)
+        self.robot = robot
+        self.contacts = tuple(contacts)
+        self.states = tuple(states)
         self.candidates = tuple(candidates)
         self.samples = structural_samples(robot, contacts, states, seed=seed)
 
@@ -101,11 +103,12 @@ def irredundant_set(
     Raises:
         SensorError: without the excluded candidates the rank is lower.
     """
-    kept, excluded = frozenset(keep), frozenset(exclude)
+    kept = frozenset(keep)
+    excluded = frozenset(exclude)
     chosen = [c for c in stack.candidates if c not in excluded]
     if stack.rank(chosen) < stack.full:
-        found = f"without {', '.join(sorted(c.name for c in excluded))} fewer parameters are determined"
-        raise SensorError("sensors", "exclude", found, "other exclusions, or criterion: per_sample")
+        reason = f"without {', '.join(sorted(c.name for c in excluded))} fewer parameters are determined"
+        raise SensorError("sensors", "exclude", reason, "other exclusions, or criterion: per_sample")
     for candidate in sorted(set(chosen) - kept, key=lambda c: (-c.cost, stack.candidates.index(c))):
         fewer = [c for c in chosen if c is not candidate]
         if stack.rank(fewer) == stack.full:
@@ -177,7 +180,9 @@ class SetRanking:
         Directions are (B, c, n_rows); channels that the other sensors read too have none.
         """
         J = builder.contact_jacobian(samples)
-        base, owners, ways = builder.tree.base_rows, dict[tuple[int | None, int], set[int]](), []
+        base = builder.tree.base_rows
+        owners = dict[tuple[int | None, int], set[int]]()
+        ways = []
         for number, candidate in enumerate(self.candidates):
             for contact, k in candidate.readings:
                 if (contact, k) in self._always or (contact is not None and not state[contact]):
@@ -433,7 +438,8 @@ def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None)
     if problem.criterion == "stack":
         done = _counted(report, "leaving sensors out", len(problem.candidates))
         chosen = irredundant_set(problem.stack, problem.keep, problem.exclude, done)
-        cost, floor = total_cost(chosen), total_cost(problem.keep)
+        cost = total_cost(chosen)
+        floor = total_cost(problem.keep)
         least = CheapestSet(chosen, cost, floor, cost <= floor)
     else:
         all_demands = demands(problem.robot, problem.contacts, problem.states, problem.candidates, problem.seed)
@@ -467,7 +473,8 @@ def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[Contact
     used = [contact.frame for contact, *active in zip(contacts, *states, strict=True) if any(active)]
     tree = KinematicTree(robot)
     above = {frame: {tree.body_of[node] for node in tree.path(tree.frame(robot, frame)[0])} for frame in used}
-    children, out = robot.children, []
+    children = robot.children
+    out = []
     for first, body in enumerate(robot.bodies[1:], start=1):
         if body.parent > 0 and len(children[body.parent]) == 1:
             continue
@@ -517,8 +524,9 @@ def _best_parts(
     out = []
     for part in parts:
         frames = tuple(dict.fromkeys(frame for demand in part.demands for frame in demand.frames))
-        own = frozenset(part.candidates)
-        keep, exclude = problem.keep & own, problem.exclude & own
+        of_part = frozenset(part.candidates)
+        keep = problem.keep & of_part
+        exclude = problem.exclude & of_part
         sets = all_minimal_sets(part.demands, part.candidates, keep, exclude)
         initial = tuple(c for c in part.candidates if c in chosen)
         ranking = SetRanking(
@@ -526,7 +534,7 @@ def _best_parts(
             contacts=problem.contacts,
             logs=logs,
             candidates=part.candidates,
-            others=tuple(chosen - own),
+            others=tuple(chosen - of_part),
             noise=problem.noise,
             prior=problem.prior,
         )
@@ -534,7 +542,7 @@ def _best_parts(
         bound = total_cost(initial) * (1.0 + _EXACT)
         cheapest = [initial] if sets is None else [s for s in sets if total_cost(s) <= bound]
         ranked = rank_sets(ranking, cheapest, _counted(report, description, len(cheapest)))
-        chosen = (chosen - own) | frozenset(ranked[0].sensors)
+        chosen = (chosen - of_part) | frozenset(ranked[0].sensors)
         out.append(PartPlan(frames, part.candidates, None if sets is None else tuple(sets), tuple(ranked)))
     return tuple(out), tuple(c for c in problem.candidates if c in chosen)
 

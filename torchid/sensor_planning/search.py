@@ -26,7 +26,9 @@ from torchid.sensor_planning.observability import (
     total_cost,
 )
 
-_DEVICES, _COMBINATIONS, _BATCH = 5, 100_000, 4096
+_DEVICES = 5
+_COMBINATIONS = 100_000
+_BATCH = 4096
 _MEMORY = 2**22  # numbers in one batch of the enumeration
 _MOST_FREE = 14  # candidates of which all sets are enumerated
 _EXACT = 1e-7  # relative accuracy of the integer program
@@ -66,7 +68,8 @@ def cheapest_set(
     deadline = time.monotonic() + seconds
     solved = [_cheapest_part(part, kept, deadline) for part in demand_groups(demands, usable)]
     chosen = kept.union(*(result.chosen for result in solved))
-    beside, cost = total_cost(kept.difference(*(result.chosen for result in solved))), total_cost(chosen)
+    beside = total_cost(kept.difference(*(result.chosen for result in solved)))
+    cost = total_cost(chosen)
     return CheapestSet(
         tuple(c for c in candidates if c in chosen),
         cost,
@@ -105,7 +108,8 @@ def all_minimal_sets(
     numbers = np.arange(2 ** len(free))
     member = (numbers[:, None] >> np.arange(len(free))) & 1 == 1  # (sets, candidates)
     size = member.sum(1)
-    sufficient, minimal = np.zeros(len(numbers), dtype=bool), []
+    sufficient = np.zeros(len(numbers), dtype=bool)
+    minimal = []
     for count in range(len(free) + 1):
         same = numbers[size == count]
         for bit in range(len(free)):  # a sufficient set with one more candidate is sufficient, and not minimal
@@ -124,7 +128,8 @@ def _usable_candidates(
     Raises:
         SensorError: they do not suffice, or one is both kept and excluded.
     """
-    kept, excluded = frozenset(keep), frozenset(exclude)
+    kept = frozenset(keep)
+    excluded = frozenset(exclude)
     for contradiction in kept & excluded:
         raise SensorError("sensors", "keep", f"'{contradiction.name}', which is also excluded", "one or the other")
     usable = tuple(c for c in candidates if c not in excluded)
@@ -134,9 +139,9 @@ def _usable_candidates(
         if (missing := demand.missing(usable))
     ]
     if lacking:
-        found = f"all of them leave {'; '.join(lacking)} undetermined"
+        reason = f"all of them leave {'; '.join(lacking)} undetermined"
         raise SensorError(
-            "sensors", "candidates", found, "more candidates: joints on the way there, contact components"
+            "sensors", "candidates", reason, "more candidates: joints on the way there, contact components"
         )
     return kept, usable
 
@@ -179,10 +184,12 @@ def bound_cost(demand: Demand, candidates: Sequence[Candidate]) -> CostBound:
     single = sorted((c for c in acting if c not in devices), key=lambda c: c.cost)
     if len(devices) > _DEVICES:
         return CostBound(0.0, ())
-    cost, best = np.array([c.cost for c in single]), CostBound(math.inf, ())
+    cost = np.array([c.cost for c in single])
+    best = CostBound(math.inf, ())
     for taken in chain.from_iterable(combinations(devices, count) for count in range(len(devices) + 1)):
         basis = orthonormal_basis(demand.stacked(taken))
-        target, vectors = orthogonal_part(demand.target, basis), orthogonal_part(demand.stacked(single), basis)
+        target = orthogonal_part(demand.target, basis)
+        vectors = orthogonal_part(demand.stacked(single), basis)
         bound, indices = _cheapest_vectors(span_basis(target), vectors, cost)
         bound += total_cost(taken)
         if bound < best.bound:
@@ -227,16 +234,17 @@ def _cheapest_part(part: DemandGroup, kept: AbstractSet[Candidate], deadline: fl
         for d, least in zip(part.demands, alone, strict=True)
     ]
     guesses = [frozenset(chosen for least in alone for chosen in least.chosen), *(frozenset(a.chosen) for a in alone)]
-    best, bound = min((_pruned(part, guess, kept) for guess in guesses), key=total_cost), max(a.bound for a in alone)
+    best = min((_pruned(part, guess, kept) for guess in guesses), key=total_cost)
+    bound = max(a.bound for a in alone)
     while True:
         A = np.unique(np.array(cuts).reshape(-1, len(cost) + 1), axis=0)
-        left = max(deadline - time.monotonic(), 0.0)
+        seconds_left = max(deadline - time.monotonic(), 0.0)
         solved = milp(
             cost,
             constraints=LinearConstraint(A[:, :-1], A[:, -1], np.inf),
             integrality=np.ones(len(cost)),
             bounds=Bounds(must, 1.0),
-            options={"mip_rel_gap": 0.0, "time_limit": left},
+            options={"mip_rel_gap": 0.0, "time_limit": seconds_left},
         )
         bound = max(bound, solved.mip_dual_bound or 0.0)
         if solved.status != 0:  # out of time
@@ -272,59 +280,66 @@ def _sufficient(
     for demand in demands:
         acting = [k for k, c in enumerate(free) if c in demand.vectors]
         owner = np.repeat(acting, [demand.vectors[free[k]].shape[1] for k in acting]).astype(int)
-        always, vectors = demand.stacked(kept), demand.stacked(free)
-        for some in np.array_split(np.flatnonzero(result), 1 + len(member) * vectors.size // _MEMORY):
-            masked = vectors * member[some][:, None, owner]
-            fixed = np.broadcast_to(always, (len(some), *always.shape))
+        always = demand.stacked(kept)
+        vectors = demand.stacked(free)
+        for batch in np.array_split(np.flatnonzero(result), 1 + len(member) * vectors.size // _MEMORY):
+            masked = vectors * member[batch][:, None, owner]
+            fixed = np.broadcast_to(always, (len(batch), *always.shape))
             basis = orthonormal_basis(np.concatenate([fixed, masked], axis=2))
-            result[some] = demand.unreached(basis) == 0
+            result[batch] = demand.unreached(basis) == 0
     return result
 
 
 def _cheapest_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float, Sequence[int]]:
     """Bound and indices of the cheapest vectors, of (k, N) by ascending cost (N,), that span a target (k, d)."""
-    d, length = target.shape[1], np.linalg.norm(vectors, axis=0)
+    d = target.shape[1]
+    length = np.linalg.norm(vectors, axis=0)
     if d == 0:
         return 0.0, ()
     indices = np.flatnonzero(length > SPAN_TOLERANCE)
-    vectors, cost = vectors[:, indices] / length[indices], cost[indices]
-    rest = orthogonal_part(vectors, target)
-    length = np.linalg.norm(rest, axis=0)
+    vectors = vectors[:, indices] / length[indices]
+    cost = cost[indices]
+    outside = orthogonal_part(vectors, target)
+    length = np.linalg.norm(outside, axis=0)
     inside = length <= SPAN_TOLERANCE
-    rest = (span_basis(rest).T @ rest) / np.where(inside, 1.0, length)  # (dimensions modulo the target, N)
-    best, chosen, budget = math.inf, np.zeros(0, dtype=int), _COMBINATIONS
-    for g in range(len(rest) + 1):
+    outside = (span_basis(outside).T @ outside) / np.where(inside, 1.0, length)  # (dimensions modulo the target, N)
+    best = math.inf
+    chosen = np.zeros(0, dtype=int)
+    budget = _COMBINATIONS
+    for g in range(len(outside) + 1):
         floor = float(cost[: d + g].sum()) if d + g <= len(cost) else math.inf
-        budget -= math.comb(int((~inside).sum()), g) if g < len(rest) else 1
+        budget -= math.comb(int((~inside).sum()), g) if g < len(outside) else 1
         if floor >= best or budget < 0:
             return min(best, floor), indices[chosen].tolist()
-        for flat in _flats(rest, inside, g, d + g):
+        for flat in _flats(outside, inside, g, d + g):
             basis = _cheapest_basis(vectors, flat)
             if len(basis) == d + g and cost[basis].sum() < best:
-                best, chosen = float(cost[basis].sum()), np.array(basis)
+                best = float(cost[basis].sum())
+                chosen = np.array(basis)
     return best, indices[chosen].tolist()
 
 
-def _flats(rest: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.ndarray]:
+def _flats(outside: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.ndarray]:
     """Members (N,) bool of flats of dimension g with at least `least` members."""
-    if g == len(rest):
-        yield np.ones(rest.shape[1], dtype=bool)
+    if g == len(outside):
+        yield np.ones(outside.shape[1], dtype=bool)
         return
     generators = combinations(np.flatnonzero(~inside).tolist(), g)
-    while some := list(islice(generators, _BATCH)):
-        picked = np.array(some, dtype=int).reshape(len(some), g)
-        basis = orthonormal_basis(rest[:, picked].transpose(1, 0, 2))  # (some, dimensions, g)
-        member = (np.linalg.norm(orthogonal_part(rest, basis), axis=1) <= SPAN_TOLERANCE) | inside
+    while batch := list(islice(generators, _BATCH)):
+        picked = np.array(batch, dtype=int).reshape(len(batch), g)
+        basis = orthonormal_basis(outside[:, picked].transpose(1, 0, 2))  # (batch, dimensions, g)
+        member = (np.linalg.norm(orthogonal_part(outside, basis), axis=1) <= SPAN_TOLERANCE) | inside
         yield from np.unique(member[member.sum(1) >= least], axis=0)
 
 
 def _cheapest_basis(vectors: Array, flat: np.ndarray) -> list[int]:
     """Indices of independent vectors among the members (N,) bool of a flat, chosen greedily."""
-    basis, chosen = np.zeros((len(vectors), 0)), []
+    basis = np.zeros((len(vectors), 0))
+    chosen = []
     for index in np.flatnonzero(flat).tolist():
-        left = orthogonal_part(vectors[:, [index]], basis)
-        length = np.linalg.norm(left)
+        residual = orthogonal_part(vectors[:, [index]], basis)
+        length = np.linalg.norm(residual)
         if length > SPAN_TOLERANCE:
-            basis = np.hstack([basis, left / length])
+            basis = np.hstack([basis, residual / length])
             chosen.append(index)
     return chosen
