@@ -1,23 +1,24 @@
-"""Robots, and places to run commands in, that several test files use."""
+"""Robots, finished runs and places to run commands in that test files share; no test may take long."""
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import os
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
-from demo import shortened_demo
+from demo import DEMO, shortened_demo
 from hostile_commands import Commands
-from made_once import made_once
 from run_figures import EVENTS, draw, draw_nothing
 from synthetic import load
 
 import torchid
+from torchid.cli import main
 from torchid.robot import Robot
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a run started in the background inherits one that is ignored
@@ -29,6 +30,55 @@ def pytest_collection_finish() -> None:
     """Look for garbage less often than after every 700 new objects, which takes a tenth of all tests' time."""
     gc.set_threshold(20_000, 10, 10)
     gc.enable()
+
+
+CALL_SECONDS = 2.0
+"""Processor time that a test may take, without its fixtures, unless it is marked as slow."""
+LIMITED = ("api", "defaults", "hostile", "identifiability", "legged", "paper")
+"""Folders whose tests are all that fast, or marked; others follow."""
+_IMPORTED_MODULES = 30
+"""A test that is the first to import so many pays for others too, and is not judged."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Fail a test that takes longer, in this process and in those that it has waited for."""
+    slow = item.get_closest_marker("slow")
+    if slow is not None and not slow.args:
+        pytest.fail('slow without a reason; accepted: pytest.mark.slow("why"), or pytest.mark.study', pytrace=False)
+    modules = len(sys.modules)
+    before = sum(os.times()[:4])
+    result = yield
+    seconds = sum(os.times()[:4]) - before
+    limited = item.path.relative_to(Path(__file__).parent).parts[0] in LIMITED
+    judged = slow is None and len(sys.modules) < modules + _IMPORTED_MODULES
+    if limited and judged and seconds > CALL_SECONDS:
+        pytest.fail(
+            f"took {seconds:.1f} s of processor time, more than {CALL_SECONDS:g} s; accepted: fewer samples, a smaller "
+            'robot, a fixture that is shared, or pytest.mark.slow("why")',
+            pytrace=False,
+        )
+    return result
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that the first worker that asks for it makes, and all others wait for and read.
+
+    Args:
+        factory: of this worker.
+        name: of the folder's parent, which holds nothing else.
+        make: makes the folder, which is not there yet.
+    """
+    folders = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folders = folders.parent  # of the run
+    folder = folders / name / name
+    with (folders / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.parent.exists():
+            folder.parent.mkdir()
+            make(folder)
+    return folder
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -95,6 +145,24 @@ def biped_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with forked_simulations():
         return made_once(tmp_path_factory, "biped", lambda output: simulate(short(output)))
+
+
+@pytest.fixture(scope="session")
+def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of the demo as it ships, with what TensorBoard shows. Nothing may be changed in it."""
+
+    def make(output: Path) -> None:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            draw(monkeypatch, (EVENTS,))
+            assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={output}", "--quiet"]) == 0
+
+    return made_once(tmp_path_factory, "demo_run", make)
+
+
+@pytest.fixture(scope="session")
+def demo_result() -> torchid.Identification:
+    """What that run finds, in memory."""
+    return torchid.identify(DEMO / "quadruped.yaml", output=None)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import torch
 from descents import arm_log, true_arm
 from physical import PRIORS, random_case
 from synthetic import UR5, load
-from thinned import slow_but
+from thinned import study_but
 
 from torchid.estimators import Conditions, Consistent, LeastSquares, PenaltyWeights, Sgd, Trainer, violations
 from torchid.estimators.least_squares import Minimizer
@@ -22,7 +22,7 @@ RIDGE = 0.01
 
 
 @pytest.mark.parametrize("prior", PRIORS)
-@pytest.mark.parametrize("seed", slow_but([2, 4, 5], range(6)))
+@pytest.mark.parametrize("seed", study_but([2, 4, 5], range(6)))
 def test_it_ends_at_the_optimum_of_the_closed_form_under_the_same_conditions(seed: int, prior: str) -> None:
     case = random_case(np.random.default_rng(seed))
     settings = Sgd(RIDGE, prior=prior, conditions=case.conditions)

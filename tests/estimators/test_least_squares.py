@@ -12,7 +12,7 @@ from descents import arm_log, true_arm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic import UR5, Array, load
-from thinned import slow_but
+from thinned import study_but
 
 from torchid import parameters
 from torchid.estimators import LeastSquares
@@ -113,7 +113,7 @@ def test_rank_and_condition_number_are_those_of_the_scaled_problem(tolerance: fl
     assert estimate.condition_number == pytest.approx(3.0 / (1e-5 if tolerance < 1e-6 else 1e-2), rel=1e-9)
 
 
-@pytest.mark.parametrize("ridge", slow_but([0.02], [0.0, 0.02]))
+@pytest.mark.parametrize("ridge", study_but([0.02], [0.0, 0.02]))
 def test_standard_errors_are_the_spread_of_repeated_experiments(ridge: float) -> None:
     rng = np.random.default_rng(4)
     rows, columns, sigma, trials = 60, 5, 0.7, 3000

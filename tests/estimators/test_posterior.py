@@ -9,7 +9,7 @@ import pytest
 import torch
 from physical import GOOD, SCALE, active_case, nothing_seen, random_case
 from synthetic import Array
-from thinned import slow_but
+from thinned import study_but
 
 from torchid.estimators import Conditions, LeastSquares, violations
 from torchid.estimators.barrier import barrier_gaussian
@@ -41,7 +41,7 @@ def parameters_of(posterior: Posterior, deviations: Array) -> Array:
     return phi.reshape(len(phi), -1, 12)
 
 
-@pytest.mark.parametrize("seed", slow_but(range(4), range(25)))
+@pytest.mark.parametrize("seed", study_but(range(4), range(25)))
 def test_every_sample_meets_every_condition(seed: int) -> None:
     case = random_case(np.random.default_rng(seed))
     posterior = posterior_of(case.problem, case.conditions, noise=0.05)

@@ -12,7 +12,7 @@ import pytest
 import torch
 from descents import World, arm, demo, half_way, still
 from synthetic import Array
-from thinned import slow_but
+from thinned import study_but
 from torch import Tensor, nn
 
 from torchid.commands.training import load_checkpoint, save_checkpoint
@@ -205,7 +205,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 @pytest.mark.parametrize(
-    "name", slow_but([name for name in SETTINGS if "alone" not in name or "LBFGS" in name], SETTINGS)
+    "name", study_but([name for name in SETTINGS if "alone" not in name or "LBFGS" in name], SETTINGS)
 )
 def test_a_descent_taken_up_again_after_any_epoch_is_the_uninterrupted_one_to_the_last_bit(
     name: str, tmp_path: Path

@@ -71,7 +71,7 @@ def test_it_is_found_beside_armatures_springs_offsets_and_scales() -> None:
 
 
 @pytest.mark.parametrize(
-    "estimator", [LeastSquares(), pytest.param(Consistent(), marks=pytest.mark.slow)], ids=["plain", "consistent"]
+    "estimator", [LeastSquares(), pytest.param(Consistent(), marks=pytest.mark.study)], ids=["plain", "consistent"]
 )
 def test_intervals_of_95_percent_hold_the_delay_of_noisy_logs(estimator: LeastSquares | Consistent) -> None:
     logs = [preprocess(recorded(noise=NOISE, seed=seed), cutoff_hz=30.0) for seed in range(40)]

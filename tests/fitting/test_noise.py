@@ -12,7 +12,7 @@ from intervals import covered
 from scipy import stats
 from scipy.spatial.transform import Rotation
 from synthetic import SOLO12, Array, Oracle, load, make_log
-from thinned import slow_but
+from thinned import study_but
 from true_robots import true_parameters
 
 from torchid.config import load_config
@@ -187,7 +187,7 @@ def check_intervals(setup: RobotSetup, sensors: str, repeats: int) -> None:
     assert told["base_force.x"] == told["base_force.y"] == told["base_moment.x"] == "estimated"
 
 
-@pytest.mark.parametrize("sensors", slow_but(["full"], ["full", "contacts", "joints"]))
+@pytest.mark.parametrize("sensors", study_but(["full"], ["full", "contacts", "joints"]))
 def test_intervals_hold_the_truth_with_the_noise_that_residuals_show(setup: RobotSetup, sensors: str) -> None:
     check_intervals(setup, sensors, QUICK)
 

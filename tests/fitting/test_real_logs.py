@@ -84,7 +84,7 @@ def test_a_person_whose_feet_never_leave_the_plates_is_told_that_offset_and_mass
 GO2, LEGS = ROBOTS / "go2_description/urdf/go2.urdf", ("FL", "FR", "RL", "RR")
 
 
-@pytest.mark.parametrize(("cutoff", "most"), [(10.0, 0.182), pytest.param(20.0, 0.200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("cutoff", "most"), [(10.0, 0.182), pytest.param(20.0, 0.200, marks=pytest.mark.study)])
 def test_a_quadruped_in_the_air_is_predicted_with_actuators_that_can_exist(
     tmp_path: Path, cutoff: float, most: float
 ) -> None:

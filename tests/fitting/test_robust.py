@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from intervals import REPETITIONS, covered
 from scipy.optimize import least_squares
 from synthetic import UR5, Array, Oracle, load, make_log
-from thinned import SLOW
+from thinned import STUDY
 from true_robots import true_parameters
 from urdfs import inertial, joint, link, write
 
@@ -165,7 +165,7 @@ def industrial_arm(samples: int = 400, terms: ExtraTerms | None = None) -> Bench
 
 @pytest.mark.parametrize(("repetitions", "share", "kind"), [
     (40, 0.0, "huber"), (40, 0.05, "tukey"),
-    *(pytest.param(*case, marks=SLOW) for case in product([REPETITIONS], [0.0, 0.05], LOSSES)),
+    *(pytest.param(*case, marks=STUDY) for case in product([REPETITIONS], [0.0, 0.05], LOSSES)),
 ])  # fmt: skip
 def test_intervals_of_robust_fits_hold_the_truth_with_and_without_outliers(
     arm: Bench, kind: str, share: float, repetitions: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,14 @@ few = settings(max_examples=15, deadline=None, derandomize=True)
 def of_robots(*urdfs: Path) -> pytest.MarkDecorator:
     """A test per robot."""
     return pytest.mark.parametrize("urdf", urdfs, ids=lambda path: path.stem)
+
+
+def of_every_robot(always: Sequence[Path], urdfs: Iterable[Path]) -> pytest.MarkDecorator:
+    """A test per robot, all but some of which run by `-m every_robot`."""
+    cases = [
+        pytest.param(urdf, id=urdf.stem, marks=() if urdf in always else pytest.mark.every_robot) for urdf in urdfs
+    ]
+    return pytest.mark.parametrize("urdf", cases)
 
 
 def tensors(*arrays: Array) -> tuple[Tensor, ...]:

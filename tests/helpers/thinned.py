@@ -1,4 +1,4 @@
-"""Parametrized tests of which a few cases always run, and all with `-m slow` or `-m ""`."""
+"""Parametrized tests of which a few cases always run, and all with `-m study` or `-m ""`."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 
-SLOW = pytest.mark.slow
+STUDY = pytest.mark.study
 
 
-def slow_but(always: Collection[Any], cases: Iterable[Any]) -> list[Any]:
-    """The cases, one value each, all but some marked as slow."""
-    return [case if case in always else pytest.param(case, marks=SLOW) for case in cases]
+def study_but(always: Collection[Any], cases: Iterable[Any]) -> list[Any]:
+    """The cases, one value each, all but some marked as studies."""
+    return [case if case in always else pytest.param(case, marks=STUDY) for case in cases]
 
 
 def each_once(*choices: Sequence[Any], rounds: int = 1) -> list[Any]:
-    """All combinations of some choices, marked as slow but for some in which each choice comes up at least once.
+    """All combinations of some choices, marked as studies but for some in which each choice comes up at least once.
 
     In the next round each comes up with its neighbour's company.
     """
@@ -30,7 +30,7 @@ def each_once(*choices: Sequence[Any], rounds: int = 1) -> list[Any]:
     return [
         pytest.param(
             *(one[place] for one, place in zip(choices, places, strict=True)),
-            marks=() if places in always else SLOW,
+            marks=() if places in always else STUDY,
         )
         for places in product(*(range(len(one)) for one in choices))
     ]

@@ -52,7 +52,13 @@ MACHINES = {
     "Centauro": ROBOTS / "centauro_description/urdf/centauro.urdf",
 }
 CLEAR = 1e12  # 5e13 measured at worst, with the base rows of the human
-machines = pytest.mark.parametrize("name", MACHINES)
+machines = pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in ("UR5", "Solo12", "human") else pytest.mark.every_robot)
+        for name in MACHINES
+    ],
+)
 
 
 @cache

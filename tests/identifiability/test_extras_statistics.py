@@ -132,6 +132,7 @@ def slide(folder: Path) -> Robot:
     return load(write(folder, BASE, link("arm", inertial("2")), lift), None, True)
 
 
+@pytest.mark.slow("200 repetitions of noise")
 def test_95_percent_intervals_of_offsets_hold_the_truth_that_often(tmp_path: Path) -> None:
     """200 repetitions, with the noise that is stated, of five short logs of a slide."""
     robot, rng = slide(tmp_path), np.random.default_rng(9)

@@ -105,7 +105,7 @@ def test_intervals_hold_the_truth_where_errors_of_neighbours_are_alike(
     slow = once[torch.arange(len(once)).repeat_interleave(8)]  # slow motion, and noise that is as slow
     samples = replace(slow, time=torch.arange(len(slow)) * 0.01)
     held, by_noise, lack = [], [], []
-    for _ in range(12):
+    for _ in range(6):
         noise = signal.lfilter([np.sqrt(1 - 0.9**2)], [1.0, -0.9], rng.normal(size=(len(samples), 12)), axis=0)
         folds = split_into_folds([noisy(samples, NOISE * noise)], fitter.builder)
         fit = fitter.fit(compress_in_blocks(folds, fitter.builder))
@@ -119,7 +119,7 @@ def test_intervals_hold_the_truth_where_errors_of_neighbours_are_alike(
     assert np.concatenate(held).mean() > 0.9
     assert np.concatenate(by_noise).mean() < 0.75
     known_lack = [one for one in lack if one is not None]
-    assert len(known_lack) == (12 if blocks == 20 else 0), "five blocks do not tell it from noise"
+    assert len(known_lack) == (6 if blocks == 20 else 0), "five blocks do not tell it from noise"
     assert min(known_lack, default=np.inf) > 3.0
 
 

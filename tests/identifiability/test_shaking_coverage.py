@@ -80,7 +80,7 @@ def test_intervals_of_friction_hold_the_truth_on_a_shaking_log() -> None:
     assert friction >= 0.9  # 0.2 where the sign is that of velocities behind the filter
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 @pytest.mark.parametrize("kind", list(MOTIONS))
 @pytest.mark.parametrize("velocity_noise", [0.0, 0.01])

@@ -18,7 +18,7 @@ from mistaken import case_of
 from motions import value
 from repository import CONFIGS, SHARED
 from synthetic import PANDA, ROBOTS, Oracle, load
-from thinned import each_once, slow_but
+from thinned import each_once, study_but
 from urdfs import joint, link, write
 from walking import MACHINES, robot_of
 
@@ -178,7 +178,7 @@ def test_reversed_torques_of_a_standing_robot_are_seen_through_the_contacts_null
     assert set(only(of_demo(log), "sign").channels) == {"front_left_thigh", "front_right_knee"}
 
 
-@pytest.mark.parametrize("factor", slow_but([1.2], [0.5, 1.2, 2.0]))
+@pytest.mark.parametrize("factor", study_but([1.2], [0.5, 1.2, 2.0]))
 def test_torques_that_all_have_one_factor_contradict_the_contact_forces(factor: float) -> None:
     case = case_of(MACHINES["quadruped"], "full")
     wrong = replace(case.log, joint_torque=factor * value(case.log.joint_torque))
@@ -189,7 +189,7 @@ def test_torques_that_all_have_one_factor_contradict_the_contact_forces(factor: 
     assert float(value(stated)[1]) == pytest.approx(1.0 / factor, rel=0.2)
 
 
-@pytest.mark.parametrize("factor", slow_but([1.2], [0.8, 1.0, 1.2]))
+@pytest.mark.parametrize("factor", study_but([1.2], [0.8, 1.0, 1.2]))
 def test_a_common_factor_of_a_bolted_arms_torques_is_noted_as_one_of_torques_or_masses(factor: float) -> None:
     """Beside masses up to 15 % off; the factor itself within three of its standard deviations."""
     case = case_of(MACHINES["arm"], "contacts")
@@ -280,7 +280,7 @@ OF_ONE_RATE = {(0, 5), (1, 4), (3, 6)}
 OTHER_PAIRS = [pair for pair in itertools.combinations(range(7), 2) if pair not in OF_ONE_RATE]
 
 
-@pytest.mark.parametrize("pair", slow_but([(1, 2), (0, 6), (4, 5)], OTHER_PAIRS))
+@pytest.mark.parametrize("pair", study_but([(1, 2), (0, 6), (4, 5)], OTHER_PAIRS))
 def test_torques_of_any_two_joints_that_are_exchanged_are_named(pair: tuple[int, int]) -> None:
     """Of wrists, too, whose torques are a hundredth of the shoulder's."""
     order = list(range(len(arm()[1].joint_names)))

@@ -103,7 +103,7 @@ READINGS = {
 @pytest.mark.parametrize(
     ("late", "rate"),
     [("contact forces", 0.0), ("forces of r_sole", 0.0), ("torques", 0.003), ("contact forces", 0.003)]
-    + [pytest.param("the joints' motion", 0.0, marks=pytest.mark.slow)],
+    + [pytest.param("the joints' motion", 0.0, marks=pytest.mark.study)],
 )
 def test_of_torques_forces_and_motion_the_one_that_the_others_contradict_is_late(late: str, rate: float) -> None:
     """By 30 ms, or by a clock that is 0.3 % fast, from 0 to 36 ms."""

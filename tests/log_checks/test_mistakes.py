@@ -16,7 +16,7 @@ from motions import value
 from recordings import in_world
 from scipy.spatial.transform import Rotation
 from synthetic import Oracle
-from thinned import SLOW
+from thinned import STUDY
 from walking import MACHINES, robot_of, truth
 
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped
@@ -35,12 +35,12 @@ BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
 UNNAMED = {("wrenches about another point", "biped", "contacts")}
 #: Of a robot that walks upright along the world's x axis, with all sensors.
 UPRIGHT = (
-    pytest.param("torques reversed", marks=pytest.mark.slow),
-    pytest.param("wrenches reversed", marks=pytest.mark.slow),
-    pytest.param("world downward", marks=pytest.mark.slow),
-    pytest.param("contact flags left for right", marks=pytest.mark.slow),
+    pytest.param("torques reversed", marks=pytest.mark.study),
+    pytest.param("wrenches reversed", marks=pytest.mark.study),
+    pytest.param("world downward", marks=pytest.mark.study),
+    pytest.param("contact flags left for right", marks=pytest.mark.study),
     "quaternion w last for first",
-    pytest.param("quaternion inverse", marks=pytest.mark.slow),
+    pytest.param("quaternion inverse", marks=pytest.mark.study),
     "time x 2",
     "time in minutes",
     "one torque x 1.3",
@@ -166,7 +166,7 @@ def test_names_without_sides_have_none_to_exchange() -> None:
     assert list(exchanged_names(("one",))) == []
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("machine", MACHINES)
 def test_who_names_which_mistake(machine: str) -> None:
@@ -176,7 +176,7 @@ def test_who_names_which_mistake(machine: str) -> None:
     assert unnamed == {cell for cell in UNNAMED if cell[1] == machine}
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_forty_logs_of_robots_unlike_their_urdf_give_no_alarm() -> None:
     alarms = []
     for seed in range(1, 11):
@@ -214,10 +214,10 @@ def misnamed(log: Log) -> Log:
     ("mistake", "field", "text"),
     [
         (lambda log: scaled(log, "joint_torque", 1e3), "joint_torque", "in Nmm or mNm"),
-        pytest.param(lambda log: scaled(log, "joint_torque", 1e-3), "joint_torque", "in kNm", marks=SLOW),
-        pytest.param(lambda log: scaled(log, "joint_torque", -1.0), "joint_torque", "all reversed", marks=SLOW),
+        pytest.param(lambda log: scaled(log, "joint_torque", 1e-3), "joint_torque", "in kNm", marks=STUDY),
+        pytest.param(lambda log: scaled(log, "joint_torque", -1.0), "joint_torque", "all reversed", marks=STUDY),
         pytest.param(
-            lambda log: scaled(log, "contact_wrench_local", 1e-3), "contact_wrench_local", "in kN", marks=SLOW
+            lambda log: scaled(log, "contact_wrench_local", 1e-3), "contact_wrench_local", "in kN", marks=STUDY
         ),
         (lambda log: scaled(log, "contact_wrench_local", 1.0 / 9.81), "contact_wrench_local", "in kg"),
         (lambda log: scaled(log, "contact_wrench_local", -1.0), "contact_wrench_local", "all reversed"),

@@ -34,7 +34,7 @@ def scalar(log: Log) -> Log:
     return replace(log, **{FIELD: None}, contact_force_normal=value(log.contact_wrench)[..., 2].copy())
 
 
-@pytest.mark.parametrize(("component", "name"), [(2, "fz"), pytest.param(0, "fx", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("component", "name"), [(2, "fz"), pytest.param(0, "fx", marks=pytest.mark.study)])
 def test_a_wrench_with_one_component_is_taken_for_a_scalar_sensor_by_name(component: int, name: str) -> None:
     finding = only(of_demo(alone(demo_log(), component, (0, 2))), "scalar sensor")
     assert (finding.field, finding.severity) == (FIELD, SUSPICIOUS)

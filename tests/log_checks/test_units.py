@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from faults import changed, demo_log, found, moving, of_demo, only, scaled, with_rates
 from motions import uniform, value
-from thinned import slow_but
+from thinned import study_but
 
 from torchid.log_checks import NOTE, REJECTED
 from torchid.log_checks.check import check
@@ -94,7 +94,7 @@ def test_gravity_that_was_taken_out_is_missed_without_rest() -> None:
     assert (finding.severity, "gravity has been taken out" in finding.found) == (REJECTED, True)
 
 
-@pytest.mark.parametrize("unit", slow_but(["Ncm", "kgm"], ["Ncm", "kgcm", "kgm", "kNm"]))
+@pytest.mark.parametrize("unit", study_but(["Ncm", "kgm"], ["Ncm", "kgcm", "kgm", "kNm"]))
 def test_joint_torques_in_another_unit_are_named(unit: str) -> None:
     checked = of_demo(scaled(demo_log().select(slice(0, 600)), "joint_torque", 1.0 / UNITS["torque"][unit]))
     finding = only(checked, "unit, sign or frame")

@@ -23,14 +23,14 @@ def read(path: Path) -> Log:
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize(("count", "seed"), [(200, 1), pytest.param(3000, 2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("count", "seed"), [(200, 1), pytest.param(3000, 2, marks=pytest.mark.study)])
 def test_damaged_files_give_a_log_or_one_line(tmp_path: Path, suffix: str, count: int, seed: int) -> None:
     tally = examined(f"damaged {suffix}", damaged(tmp_path, suffix, count, seed), read, tmp_path)
     assert tally.faults == []
     assert tally.share("refused") > 0.3, "or the files were hardly damaged"
 
 
-@pytest.mark.parametrize(("count", "seed"), [(200, 1), pytest.param(3000, 2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("count", "seed"), [(200, 1), pytest.param(3000, 2, marks=pytest.mark.study)])
 @pytest.mark.parametrize("do_compression", [False, True])
 def test_damaged_files_of_matlab_give_a_log_or_one_line(
     tmp_path: Path, do_compression: bool, count: int, seed: int

@@ -12,7 +12,7 @@ from motions import value
 from recordings import GRAVITY, with_imu
 from scipy.spatial.transform import Rotation
 from synthetic import PANDA, Oracle, load, make_log
-from thinned import slow_but
+from thinned import study_but
 from welded import CONTACTS, SENSORS, STATES
 
 from torchid.estimators import LeastSquares
@@ -85,7 +85,7 @@ def fitter_of(robot: Robot, sensors: str) -> LogFitter:
     return LogFitter(robot=robot, builder=builder, estimator=LeastSquares())
 
 
-@pytest.mark.parametrize("sensors", slow_but(["joints"], ["full", "joints"]))
+@pytest.mark.parametrize("sensors", study_but(["joints"], ["full", "joints"]))
 def test_the_tilt_is_found_and_the_true_robot_leaves_nothing(sensors: str) -> None:
     robot, _, log = skew_machine()
     choice = choose_base_tilt([bind_log(recorded_askew(log), robot, CONTACTS)], fitter_of(robot, sensors))

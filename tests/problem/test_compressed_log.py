@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from thinned import slow_but
+from thinned import study_but
 from walking import MACHINES, recorded, robot_of, truth
 
 from torchid.logs.preprocess import preprocess
@@ -66,7 +66,7 @@ def assert_same(found: Sequence[Part], expected: Sequence[Part]) -> None:
 
 @pytest.mark.parametrize(
     "case",
-    slow_but(
+    study_but(
         [((1500,), 1.0), ((100,) * 14, 1.0), ((700, 30, 700), 1.0), ((500, 1000), 25.0)],
         [
             *(((1500,), 1.0), ((700, 800), 1.0), ((750, 750), 1.0), ((1200, 150, 150), 1.0), ((300, 1200), 1.0)),

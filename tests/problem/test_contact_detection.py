@@ -17,7 +17,7 @@ from motions import value
 from refusals import refused
 from stances import stance
 from synthetic import Array, Oracle, load
-from thinned import SLOW
+from thinned import STUDY
 from walkers import INSTALLED, WALKERS
 from walking import robot_of
 
@@ -85,12 +85,12 @@ def assert_agrees(legged: Legged, seconds: float, seed: int, least: float) -> No
     assert together >= least
 
 
-@pytest.mark.parametrize("legged", [*WALKERS[1:], pytest.param(GO2, id="Go2", marks=[INSTALLED, SLOW])])
+@pytest.mark.parametrize("legged", [*WALKERS[1:], pytest.param(GO2, id="Go2", marks=[INSTALLED, STUDY])])
 def test_flags_of_a_noisy_recording_are_those_of_the_simulator(legged: Legged) -> None:
     assert_agrees(legged, SECONDS, 0, AGREEING)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("legged", WALKERS[:2])
 def test_flags_of_a_long_noisy_recording_are_those_of_the_simulator(legged: Legged, seed: int) -> None:
@@ -113,7 +113,7 @@ def test_a_foot_that_keeps_still_stands_however_little_it_carries() -> None:
     assert missed(without, DEFAULT.light) == missed(without, by_load), "no speed without the base's angular velocity"
 
 
-@pytest.mark.parametrize("legged", [WALKERS[0], pytest.param(G1, id="G1", marks=[INSTALLED, SLOW])])
+@pytest.mark.parametrize("legged", [WALKERS[0], pytest.param(G1, id="G1", marks=[INSTALLED, STUDY])])
 def test_masses_that_are_fitted_in_between_leave_no_foot_that_stands_unnoticed(legged: Legged) -> None:
     true, exact = walked(legged)
     active = value(exact.log.contact_active)
@@ -126,7 +126,7 @@ def test_masses_that_are_fitted_in_between_leave_no_foot_that_stands_unnoticed(l
     assert missed(DEFAULT) <= 0.25 * missed(ONCE)
 
 
-@pytest.mark.parametrize("legged", [WALKERS[1], pytest.param(GO2, id="Go2", marks=[INSTALLED, SLOW])])
+@pytest.mark.parametrize("legged", [WALKERS[1], pytest.param(GO2, id="Go2", marks=[INSTALLED, STUDY])])
 def test_contacts_that_may_stand_leave_nothing_that_carries_out_of_more_samples(legged: Legged) -> None:
     true, exact = walked(legged)
     found = detect_contacts(exact.log, true.robot, legged.contacts(), DEFAULT)
@@ -155,7 +155,7 @@ def test_a_foot_that_the_floor_pulls_is_not_taken_for_one_in_the_air() -> None:
     assert (standing & ~flags)[trusted].mean() < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @INSTALLED
 def test_parameters_of_the_wider_filter_show_a_foot_that_hardly_touches(monkeypatch: pytest.MonkeyPatch) -> None:
     """A foot of G1 touches for 80 ms with less than 0.8 % of the weight, which parameters of 20 Hz are not good for."""
@@ -240,8 +240,8 @@ def test_samples_whose_flags_may_be_wrong_are_not_certain() -> None:
     ("legged", "recorded"),
     [
         pytest.param(GO2, NO_IMU, id="Go2, orientation alone", marks=INSTALLED),
-        pytest.param(GO2, NO_BASE, id="Go2, nothing of the base", marks=[INSTALLED, SLOW]),
-        pytest.param(QUADRUPED, NO_IMU, id="quadruped, orientation alone", marks=SLOW),
+        pytest.param(GO2, NO_BASE, id="Go2, nothing of the base", marks=[INSTALLED, STUDY]),
+        pytest.param(QUADRUPED, NO_IMU, id="quadruped, orientation alone", marks=STUDY),
         pytest.param(QUADRUPED, NO_BASE, id="quadruped, nothing of the base"),
     ],
 )

@@ -52,6 +52,6 @@ def test_five_times_the_samples_need_no_more_memory_beside_their_arrays() -> Non
     assert long["all"] - long["arrays"] < short["all"] - short["arrays"] + 80.0  # allocators keep some slack
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_million_samples_of_a_quadruped_fit_in_two_gibibytes() -> None:
     assert fits(1_000_000)[0]["all"] < 2048.0

@@ -34,7 +34,7 @@ from torchid.sensing import Contact, SensorNoise, SensorSet
 BASE = np.array([0.7, 0.9, 1.1, 0.05, 0.06, 0.08])  # standard deviations along the axes of the levelled base
 NOISE = SensorNoise(0.3, 1.5, 0.1, tuple(BASE[:3].tolist()), tuple(BASE[3:].tolist()), ft_force=0.9, ft_moment=0.02)
 JOINT, WRENCH, LIMB = 0.3, *(np.repeat(pair, 3) for pair in ((1.5, 0.1), (0.9, 0.02)))  # of NOISE once more
-SLOW = [pytest.mark.slow]
+STUDY = [pytest.mark.study]
 EXACT = 1e-11  # of the largest number; 1e-12 measured
 
 LEGS = ("LF", "RF", "LH", "RH")
@@ -290,7 +290,7 @@ MIXED = ("full", "some components")
 @pytest.mark.parametrize(
     ("name", "convention", "sensors"),
     [
-        pytest.param(*case, sensors, marks=[] if always([*MACHINES].index(case[0]), *case, sensors) else SLOW)
+        pytest.param(*case, sensors, marks=[] if always([*MACHINES].index(case[0]), *case, sensors) else STUDY)
         for case in CASES
         for sensors in SETS
     ],

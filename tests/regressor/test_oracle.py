@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 import torch
 from mujoco_oracle import joint_addresses, mujoco_forces, mujoco_model
-from regressors import assert_close, base_kinds, of_robots, regressor, without_shapes
+from regressors import assert_close, base_kinds, of_every_robot, of_robots, regressor, without_shapes
 from synthetic import (
     ANYMAL,
     BAXTER,
@@ -47,7 +47,7 @@ XARM = ROBOTS / "xarm_description/urdf/xarm7.urdf"
 
 
 @base_kinds
-@of_robots(*REAL)
+@of_every_robot([SOLO12, G1, PANDA], REAL)
 def test_every_inertial_column_and_nominal_forces_are_pinocchios(urdf: Path, fixed_base: bool) -> None:
     robot = load(urdf, fixed_base=fixed_base)
     state = random_states(np.random.default_rng(0), robot.n, 3, fixed_base)

@@ -163,7 +163,7 @@ def support(shape: object, direction: Array) -> float:
     [
         (G1, "collision"),
         (SOLO12, "visual"),
-        pytest.param(TALOS, "collision", marks=pytest.mark.slow),
+        pytest.param(TALOS, "collision", marks=pytest.mark.study),
         (PANDA, "collision"),
     ],
     ids=lambda value: value if isinstance(value, str) else value.stem,

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import ROBOTS, joint_map
+from regressors import of_every_robot
+from synthetic import G1, PANDA, ROBOTS, SOLO12, joint_map
 from urdfs import ARM, BASE, HINGE, inertial, joint, link, refusal, warned, write
 
 from torchid.errors import MasslessBodyWarning, UnknownNameError, UnphysicalInertiaWarning, UrdfError
@@ -82,15 +83,15 @@ def test_there_are_69_real_robots() -> None:
     assert len(REAL) == 69
 
 
-@pytest.mark.parametrize("path", REAL, ids=lambda path: path.name)
-def test_a_real_robot_is_read_whole_or_refused_for_its_true_fault(path: Path) -> None:
-    if path.name in REFUSED:
-        kind, expected = REFUSED[path.name]
-        assert expected in refusal(path, kind)
+@of_every_robot([SOLO12, G1, PANDA, *(path for path in REAL if path.name in REFUSED)], REAL)
+def test_a_real_robot_is_read_whole_or_refused_for_its_true_fault(urdf: Path) -> None:
+    if urdf.name in REFUSED:
+        kind, expected = REFUSED[urdf.name]
+        assert expected in refusal(urdf, kind)
         return
-    robot, caught = warned(path)
+    robot, caught = warned(urdf)
     assert {w.category for w in caught} <= {UnphysicalInertiaWarning, MasslessBodyWarning}
-    moving = joint_map(path, robot.joint_names)
+    moving = joint_map(urdf, robot.joint_names)
     assert set(moving) == {body.joint.name for body in robot.bodies if body.joint is not None}
     independent = [name for name, (row, _) in moving.items() if name in robot.joint_names and row.sum() == 1.0]
     assert sorted(independent) == sorted(robot.joint_names)

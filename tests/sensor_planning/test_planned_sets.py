@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from synthetic import Array
-from thinned import slow_but
+from thinned import study_but
 from true_robots import KINDS, Kind, World, driving, fit, predicted, stepping, unseen, world, worst
 
 from torchid import parameters
@@ -91,9 +91,9 @@ cases = pytest.mark.parametrize(
     ("name", "per"),
     [
         ("Talos", "device"),
-        *(pytest.param(name, "device", marks=pytest.mark.slow) for name in ("G1", "ANYmal")),
+        *(pytest.param(name, "device", marks=pytest.mark.study) for name in ("G1", "ANYmal")),
         ("ANYmal", "axis"),
-        *(pytest.param(name, "axis", marks=pytest.mark.slow) for name in ("G1", "Talos")),
+        *(pytest.param(name, "axis", marks=pytest.mark.study) for name in ("G1", "Talos")),
     ],
 )
 
@@ -127,7 +127,7 @@ def test_one_sensor_less_loses_the_base_in_some_state_but_not_what_the_stack_of_
         assert found.stack_rank == found.stack_full == 10 + 7 * world(name).robot.n
 
 
-@pytest.mark.parametrize("name", slow_but(["ANYmal"], ["ANYmal", "G1"]))
+@pytest.mark.parametrize("name", study_but(["ANYmal"], ["ANYmal", "G1"]))
 def test_fewer_sensors_than_every_sample_needs_recover_unseen_motion_too(name: str) -> None:
     """A handful of channels, with which no sample of double support sees the base, where the criterion asks for 12."""
     w = world(name)

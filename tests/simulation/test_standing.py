@@ -105,7 +105,7 @@ def solo12() -> SimulationConfig:
 
 
 @pytest.mark.parametrize(
-    "config", [g1(), quadruped(), pytest.param(solo12(), marks=pytest.mark.slow)], ids=["G1", "quadruped", "Solo12"]
+    "config", [g1(), quadruped(), pytest.param(solo12(), marks=pytest.mark.study)], ids=["G1", "quadruped", "Solo12"]
 )
 def test_other_robots_stand_where_they_are_put_and_squat_as_far_as_they_are_told(config: SimulationConfig) -> None:
     simulation = set_up_simulation(config)
