@@ -8,8 +8,8 @@ import numpy as np
 from hostile_logs import Cases, mutated
 
 NUMBERS = (
-    *("NaN", "Infinity", "-Infinity", "1e400", "1e308", "-1e308", "1e-320", "null", "true", '"1"', "[]", "{}", "[[[]]]"),
-    *("9" * 400, "-" + "9" * 400, "9" * 5000, "0" * 10, "1e", "1E+999999999", "0x1", "1_0", "١", ".5", "+1", "nul", '"\\ud800"'),
+    *("NaN", "-Infinity", "1e400", "1e308", "null", "true", '"1"', "[]", "{}", "9" * 5000, "1e", "0x1", "+1"),
+    '"\\ud800"',
 )  # fmt: skip
 
 
@@ -21,8 +21,8 @@ def parameter_files(path: Path, count: int, seed: int) -> Cases:
             path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
             yield name, path
         for value in NUMBERS:
-            for old in ('"m": ', '"fv": ', '"Ixx": ', '"identified": ', '"name": ', '"bodies": '):
-                place = whole.index(old, whole.index('"identified": {') if old in ('"m": ', '"fv": ', '"Ixx": ') else 0)
+            for old in ('"m": ', '"fv": ', '"name": ', '"bodies": '):
+                place = whole.index(old, whole.index('"identified": {') if old in ('"m": ', '"fv": ') else 0)
                 end = min(x for x in (whole.find(mark, place + len(old)) for mark in (",", "\n")) if x > 0)
                 path.write_text(whole[: place + len(old)] + value + whole[end:])
                 yield f"{old}{value[:20]}", path
@@ -40,25 +40,14 @@ def _documents(whole: str) -> dict[str, str | bytes]:
     return {
         "nothing": "",
         "a list": "[]",
-        "null": "null",
         "no bodies": "{}",
-        "bodies that are null": '{"bodies": null}',
-        "bodies that are a number": '{"bodies": 3}',
-        "bodies that are a text": '{"bodies": "abc"}',
         "bodies that are a mapping": '{"bodies": {"a": 1}}',
-        "bodies that are lists": '{"bodies": [[], [1]]}',
         "10^5 brackets": deep,
-        "10^5 brackets in a body": f'{{"bodies": [{deep}]}}',
-        "10^5 open brackets": "[" * 100_000,
-        "10^5 mappings": '{"a":' * 100_000,
         "10^5 bodies": '{"bodies": [' + ",".join(['{"name": "x"}'] * 100_000) + "]}",
         "a number of 10^6 digits": '{"bodies": ' + "9" * 10**6 + "}",
         "a key twice": whole.replace('"bodies"', '"bodies": [], "bodies"', 1),
         "NUL": whole.replace("name", "na\0me"),
         "not UTF-8": b'{"bodies": "\xff\xfe"}',
-        "UTF-16": whole.encode("utf-16"),
-        "a byte order mark": b"\xef\xbb\xbf" + whole.encode(),
-        "half a letter": '{"bodies": "\ud800"}',
         "names with an escape": whole.replace('"name": "', '"name": "\\u001b[2J'),
         "20 MB of blanks": whole + " " * 20_000_000,
         "one body too many": whole.replace('"bodies": [', '"bodies": [{"name": "x"},', 1),

@@ -15,13 +15,13 @@ import pytest
 from hostile_commands import Commands
 from refusals import files_in
 from run_folders import names_in
-from thinned import slow_but
+from thinned import study_but
 
 from torchid.staging import NEW, staging_folder
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP)
 COMMANDS = ("identify", "train", "evaluate", "analyze", "convert", "compress")
-TIMES = [1, pytest.param(25, marks=pytest.mark.slow)]
+TIMES = [1, pytest.param(25, marks=pytest.mark.study)]
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +66,7 @@ def hidden(out: Path) -> list[str]:
     return sorted(str(path.relative_to(out)) for path in found)
 
 
+@pytest.mark.slow("each command three times")
 @pytest.mark.parametrize("times", TIMES)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_stopped_at_any_moment_leaves_all_or_nothing(
@@ -105,7 +106,8 @@ def test_a_command_stopped_at_any_moment_leaves_all_or_nothing(
             assert hidden(out) == [], f"{case}: left by the killed command"
 
 
-@pytest.mark.parametrize("number", slow_but([signal.SIGTERM], [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]))
+@pytest.mark.slow("a run three times")
+@pytest.mark.parametrize("number", study_but([signal.SIGTERM], [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]))
 def test_a_run_that_is_replaced_is_there_at_any_moment(
     place: Path, server: Commands, run: Path, tmp_path: Path, number: signal.Signals
 ) -> None:

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 from demo import shortened_demo
 from hostile import examined
-from hostile_hdf5 import hdf5
-from hostile_logs import N, archives, damaged, fields, values
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hostile_logs import N, archives, damaged, fields, hdf5, values
 from raw_logs import write_arrays
 from refusals import refusal
 
 from torchid.errors import LogError
-from torchid.guards import MAX_FIELDS, MAX_LETTERS, MAX_NAMES
+from torchid.guards import MAX_NAMES
 from torchid.logs import read_log, write_log
 from torchid.logs.blocks import open_log_blocks
 from torchid.logs.log import LARGEST, NAN_ALLOWED
 
 SUFFIXES = (".npz", ".h5")
-COUNTS = [60, pytest.param(600, marks=pytest.mark.slow)]
 
 
 def read(path: Path) -> None:
@@ -35,24 +30,11 @@ def read(path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize("count", COUNTS)
-def test_damaged_logs_are_read_or_refused_in_one_line(tmp_path: Path, suffix: str, count: int) -> None:
-    tally = examined(f"damaged {suffix}", damaged(tmp_path, suffix, count, seed=1), read, tmp_path)
+def test_damaged_logs_and_senseless_values_are_read_or_refused_in_one_line(tmp_path: Path, suffix: str) -> None:
+    tally = examined(f"damaged {suffix}", damaged(tmp_path, suffix, 60, seed=1), read, tmp_path)
     assert tally.faults == []
     assert tally.share("refused") > 0.5
-
-
-@pytest.mark.parametrize(
-    ("suffix", "share"),
-    [
-        (".npz", 2),
-        (".h5", 8),
-        pytest.param(".npz", 1, marks=pytest.mark.slow),
-        pytest.param(".h5", 1, marks=pytest.mark.slow),
-    ],
-)
-def test_senseless_values_are_read_or_refused_in_one_line(tmp_path: Path, suffix: str, share: int) -> None:
-    tally = examined(f"values {suffix}", islice(values(tmp_path, suffix), 0, None, share), read, tmp_path)
+    tally = examined(f"values {suffix}", values(tmp_path, suffix), read, tmp_path)
     assert tally.faults == []
     assert tally.share("refused") > 0.7
 
@@ -88,8 +70,7 @@ def test_a_number_beyond_all_that_is_measured_is_refused_in_a_table(tmp_path: Pa
         read_log(tmp_path / "log.csv")
 
 
-@pytest.mark.parametrize("name", ["time", "joint_position", "joint_torque", "base_position_world", "base_quat_wxyz",
-                                  "contact_wrench_local"])  # fmt: skip
+@pytest.mark.parametrize("name", ["time", "joint_torque"])
 @pytest.mark.parametrize("memory", ["2", "0.00001"], ids=["whole", "block by block"])
 def test_no_parameters_are_identified_from_a_number_beyond_all_that_is_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, memory: str
@@ -115,8 +96,7 @@ def test_hdf5_files_that_lie_are_refused(tmp_path: Path) -> None:
     """Other types of numbers are none of the lies."""
     tally = examined("HDF5", hdf5(tmp_path), read, tmp_path)
     assert tally.faults == []
-    accepted = [x.name for x in tally.verdicts if x.outcome == "accepted"]
-    assert accepted == ["an enumeration", "half precision", "big-endian", "extended precision"]
+    assert tally.accepted == ["an enumeration", "half precision", "extended precision"]
 
 
 def test_a_file_that_points_to_another_shows_nothing_of_it(tmp_path: Path) -> None:
@@ -127,21 +107,6 @@ def test_a_file_that_points_to_another_shows_nothing_of_it(tmp_path: Path) -> No
             with pytest.raises(LogError, match="joint_torque: cannot be read"):
                 read_log(path)
     assert seen == pointing
-
-
-@settings(max_examples=30, deadline=None, derandomize=True)
-@given(st.integers(0, 3 * MAX_FIELDS), st.integers(0, 3 * MAX_LETTERS), st.sampled_from(SUFFIXES))
-def test_limits_are_far_beyond_any_log(
-    tmp_path_factory: pytest.TempPathFactory, n: int, letters: int, suffix: str
-) -> None:
-    """As many joints, of names as long: what is read, is read whole."""
-    names = [f"{k}".rjust(max(letters, 4), "j") for k in range(n)]
-    content = fields() | {name: np.zeros((40, n)) for name in fields() if name.startswith("joint_")}
-    path = write_arrays(
-        tmp_path_factory.getbasetemp() / f"many{suffix}", content | {"joint_names": np.array(names, dtype="U")}
-    )
-    if letters <= MAX_LETTERS:
-        assert read_log(path).joint_names == tuple(names)
 
 
 def test_a_log_of_too_many_names_is_refused(tmp_path: Path) -> None:

@@ -16,38 +16,27 @@ from torchid.config.settings_files import check_yaml
 from torchid.errors import ConfigError
 from torchid.guards import MAX_DEPTH, MAX_NODES
 
-COUNTS = [30, pytest.param(1000, marks=pytest.mark.slow)]
-
 
 def test_files_made_to_harm_are_refused(tmp_path: Path) -> None:
     """But for one with a mark of its encoding at the start."""
     tally = examined("settings", documents(tmp_path), load_config, tmp_path)
     assert tally.faults == []
-    assert [x.name for x in tally.verdicts if x.outcome == "accepted"] == ["a byte order mark"]
+    assert tally.accepted == ["a byte order mark"]
 
 
-@pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("load", [load_config, load_analysis])
-def test_anything_anywhere_in_a_file_is_read_or_refused(
-    tmp_path: Path, count: int, load: Callable[[Path], Any]
+def test_anything_anywhere_in_a_file_or_an_override_is_read_or_refused(
+    tmp_path: Path, load: Callable[..., Any]
 ) -> None:
-    tally = examined(f"settings for {load.__name__}", wrong_values(tmp_path, count, seed=2), load, tmp_path)
+    tally = examined("settings", wrong_values(tmp_path, 80, seed=2), load, tmp_path)
     assert tally.faults == []
     assert 0.8 < tally.share("refused") < 1.0
-
-
-@pytest.mark.parametrize("count", COUNTS)
-def test_damaged_files_are_read_or_refused(tmp_path: Path, count: int) -> None:
-    tally = examined("damaged settings", damaged(tmp_path, count, seed=3), load_config, tmp_path)
+    tally = examined("damaged settings", damaged(tmp_path, 30, seed=3), load, tmp_path)
     assert tally.faults == []
     assert tally.share("refused") > 0.8
-
-
-@pytest.mark.parametrize("count", COUNTS)
-def test_any_override_is_read_or_refused(tmp_path: Path, count: int) -> None:
     file = tmp_path / "experiment.yaml"
     file.write_text(yaml.safe_dump(BASE))
-    tally = examined("overrides", overrides(count, seed=4), lambda given: load_config(file, given), tmp_path)
+    tally = examined("overrides", overrides(30, seed=4), lambda given: load(file, given), tmp_path)
     assert tally.faults == []
     assert tally.share("refused") > 0.8
 
