@@ -14,6 +14,7 @@ import pytest
 import run_figures
 import yaml
 from demo import shortened_demo
+from pages import browser_programs, opened
 
 from torchid.boundary import run_guarded
 from torchid.cli import main
@@ -127,6 +128,7 @@ def test_a_run_writes_its_page_with_figures_that_a_browser_shows(
 
 
 MEGABYTE = 1_000_000
+WIDTH_PX = 390  # of a telephone
 
 
 def test_it_is_one_file_of_less_than_5_megabytes_that_asks_nobody_for_more(page: str) -> None:
@@ -137,3 +139,14 @@ def test_it_is_one_file_of_less_than_5_megabytes_that_asks_nobody_for_more(page:
     assert links
     assert all(link.startswith(("#", "data:,")) for link in links)
     assert "default-src 'none'" in own
+
+
+@pytest.mark.slow("starts a browser")
+@pytest.mark.skipif(browser_programs() is None, reason="neither Chromium nor Chrome with chromedriver is installed")
+def test_a_browser_shows_all_figures_within_its_width(page: str, run: Path, tmp_path: Path) -> None:
+    with opened(run / PAGE, tmp_path / "profile", WIDTH_PX) as browser:
+        assert not [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+        loaded = "return [...document.images].filter(image => image.complete && image.naturalWidth > 0).length"
+        assert browser.execute_script(loaded) == page.count("<img ")
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= WIDTH_PX
+        assert browser.execute_script("return window.hacked ?? null") is None
