@@ -130,6 +130,7 @@ class _Nothing(torch.nn.Module):
         return self.layer(v[:, :1])
 
 
+@pytest.mark.slow("fits and descents of the pages, as they show them")
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 @pytest.mark.parametrize("page", sorted({x.values[0] for x in blocks("python")} - ELSEWHERE))
 def test_python_of_the_pages_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,32 +15,27 @@ from torchid.parameters import COULOMB, PER_BODY, VISCOUS
 from torchid.report.figures import INTERVAL
 
 
-@pytest.fixture(scope="module")
-def run() -> Identification:
-    return torchid.identify(DEMO / "quadruped.yaml", output=None)
-
-
-def test_the_projection_leaves_noise_of_forces_that_nobody_measured(run: Identification) -> None:
-    time, before, after = script("concept_figures").unmeasured_forces(run)
+def test_the_projection_leaves_noise_of_forces_that_nobody_measured(demo_result: Identification) -> None:
+    time, before, after = script("concept_figures").unmeasured_forces(demo_result)
     assert before.shape == after.shape == (2, len(time))
     rms = np.sqrt(np.mean(np.square([before, after]), axis=2))
-    assert rms[0, 0] == pytest.approx(9.81 * run.mass.value, rel=0.05), "on the base: the weight"
+    assert rms[0, 0] == pytest.approx(9.81 * demo_result.mass.value, rel=0.05), "on the base: the weight"
     assert (rms[1] < 0.01 * rms[0]).all()
 
 
-def test_as_many_intervals_hold_the_truth_as_the_page_says(run: Identification) -> None:
+def test_as_many_intervals_hold_the_truth_as_the_page_says(demo_result: Identification) -> None:
     true = script("concept_figures").TRUE_FRICTION
-    errors, phi = run.estimate.standard_error.reshape(-1, PER_BODY)[1:], run.phi[1:]
+    errors, phi = demo_result.estimate.standard_error.reshape(-1, PER_BODY)[1:], demo_result.phi[1:]
     off = [abs(phi[:, k] - true[name]) / errors[:, k] for name, k in (("fc", COULOMB), ("fv", VISCOUS))]
     assert np.sum(np.less(off, INTERVAL)) == 24
     assert "24 of the 24 intervals hold it" in " ".join((ROOT / "docs" / "concepts.md").read_text().split())
 
 
 def test_every_figure_of_the_page_is_there_and_is_drawn(
-    run: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    demo_result: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = []
-    monkeypatch.setattr(torchid, "identify", lambda file, output: files.append((file, output)) or run)
+    monkeypatch.setattr(torchid, "identify", lambda file, output: files.append((file, output)) or demo_result)
     script("concept_figures").draw(tmp_path)
     assert files == [(DEMO / "quadruped.yaml", None)]
     drawn = {path.name for path in tmp_path.iterdir()}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import re
-from functools import cache
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
@@ -28,6 +27,7 @@ def run_page(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> tup
     return said, printed
 
 
+@pytest.mark.slow("all that the page shows, as it shows it")
 @pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
 def test_the_page_about_python_runs_and_prints_what_it_shows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -40,6 +40,7 @@ def test_the_page_about_python_runs_and_prints_what_it_shows(
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["from_python"]
 
 
+@pytest.mark.slow("all that the page shows, as it shows it")
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_the_recipes_print_what_they_show(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -92,7 +93,7 @@ def messages() -> list[str]:
     return re.findall(r"^\| `([^|]+)` \|", page, re.MULTILINE)
 
 
-@cache
+@pytest.fixture(scope="module")
 def said_by_the_code() -> list[str]:
     """Every text in the package; "…" stands for what is filled in."""
     texts = []
@@ -116,9 +117,9 @@ def _filled_in(part: ast.expr) -> str:
 
 
 @pytest.mark.parametrize("message", messages())
-def test_messages_that_are_explained_are_said(message: str) -> None:
+def test_messages_that_are_explained_are_said(said_by_the_code: list[str], message: str) -> None:
     pattern = ".*".join(re.escape(part) for part in message.split("…"))
-    assert any(re.search(pattern, text) for text in said_by_the_code()), "in no text of the package"
+    assert any(re.search(pattern, text) for text in said_by_the_code), "in no text of the package"
 
 
 def test_the_page_explains_what_users_meet_most() -> None:

@@ -16,7 +16,7 @@ from run_folders import names_in
 import torchid
 from torchid.cli import main
 from torchid.config import load_config
-from torchid.errors import ConfigError, InputError, LogError, UnknownNameError
+from torchid.errors import ConfigError, InputError, UnknownNameError
 from torchid.parameters import PARAMETERS
 
 FILE = DEMO / "quadruped.yaml"
@@ -38,7 +38,7 @@ def sections(demo: Path = DEMO) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo with less of its logs, and with its own estimator."""
-    folder = shortened_demo(tmp_path_factory.mktemp("short") / "demo", 400)
+    folder = shortened_demo(tmp_path_factory.mktemp("short") / "demo", 200)
     file = folder / "quadruped.yaml"
     file.write_text(
         file.read_text().replace(f"estimator: {FAST_ESTIMATOR}", "estimator: {name: consistent, ridge: auto}")
@@ -171,26 +171,13 @@ def test_logs_are_checked_from_files_and_from_memory(demo: Path, capsys: pytest.
     [
         ({"robto": "x"}, UnknownNameError, "torchid.identify: key: unknown name 'robto'; accepted: robot"),
         (
-            {"estimator": {"rigde": 1}},
-            UnknownNameError,
-            "estimator: unknown name 'rigde'; accepted: ridge",
-        ),
-        (
-            {"sensors": "all"},
-            ConfigError,
-            "torchid.identify: sensors.set: found 'all'; accepted: 'full', ",
-        ),
-        (
             {"sensors": ["joint_torque"]},
             ConfigError,
             "torchid.identify: sensors: found ['joint_torque']; accepted: ",
         ),
         ({"sensors": {"joint_torques": ["nee"]}}, UnknownNameError, "torchid.identify: sensors.joint_torques: unknown"),
-        ({"logs": "no*.npz"}, ConfigError, "torchid.identify: logs.train: no file matches"),
-        ({"logs": ["none.npz"]}, LogError, "none.npz: file: no such file"),
         ({"logs": [object()]}, ConfigError, "torchid.identify: logs.0: found <object"),
         ({"logs": {"train": [LOG]}}, ConfigError, "experiment file; torchid.write_log makes a file of a Log"),
-        ({"robot": "${oc.env:HOME}/x.urdf"}, ConfigError, "torchid.identify: robot: '${oc.env:HOME}/x.urdf', but"),
         ({"robot": None}, ConfigError, "torchid.identify: robot: found None; accepted: a mapping with urdf"),
         ({"overwrite": "often"}, ConfigError, "torchid.identify: overwrite: found 'often'"),
         ({"resume": True, "estimator": {"name": "sgd"}}, ConfigError, "--resume: set, without an output; accepted: an"),

@@ -91,11 +91,12 @@ def assert_types_are_seen(folder: Path, python: str, whole: bool, **environment:
     assert [error.rpartition("[")[2] for error in errors] == ["call-arg]", "arg-type]", "attr-defined]"], ran.stdout
 
 
+@pytest.mark.slow("mypy in a process of its own")
 def test_mypy_sees_the_types_of_this_tree(tmp_path: Path) -> None:
     assert_types_are_seen(tmp_path, sys.executable, whole=False, MYPYPATH=str(ROOT))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("editable", [False, True], ids=["installed", "editable"])
 def test_mypy_sees_the_types_of_an_installed_package(tmp_path: Path, editable: bool) -> None:
     """Installed without its dependencies, which are those of the running interpreter."""

@@ -20,7 +20,7 @@ FILE = DEMO / "quadruped.yaml"
 
 
 @pytest.fixture(scope="module")
-def things(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, object]:
+def things(demo_result: torchid.Identification, tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, object]:
     """One of each public building block, of the demo; what is checked and analyzed is short."""
     short = shortened_demo(tmp_path_factory.mktemp("short") / "demo", 200) / "quadruped.yaml"
     log, robot = torchid.read_log(DEMO / "sway_train.npz"), torchid.load_robot(DEMO / "quadruped.urdf")
@@ -35,7 +35,6 @@ def things(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, object]:
     parts = torchid.compress_parts([samples], builder)
     fit = fitter.fit(parts)
     batches = torchid.MiniBatches([samples], builder)
-    result = torchid.identify(FILE, output=None, estimator={"ridge": 0.01})
     analysis = torchid.analyze(short, output=None, estimator={"ridge": 0.01})
     checked = torchid.check(short)
     return {
@@ -74,13 +73,13 @@ def things(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, object]:
         "base parameters": torchid.base_parameters(problem),
         "loss": torchid.RobustLoss.named("huber", 1.345, 5),
         "experiment": set_up(load_config(FILE)),
-        "identification": result,
-        "metrics": result.metrics["test"].identified,
-        "body estimate": result["trunk"],
-        "body values": result["trunk"].nominal,
-        "verdicts": result["trunk"].verdict,
-        "table": result.table(),
-        "evaluation": torchid.evaluate(result, DEMO / "sway_test.npz"),
+        "identification": demo_result,
+        "metrics": demo_result.metrics["test"].identified,
+        "body estimate": demo_result["trunk"],
+        "body values": demo_result["trunk"].nominal,
+        "verdicts": demo_result["trunk"].verdict,
+        "table": demo_result.table(),
+        "evaluation": torchid.evaluate(demo_result, DEMO / "sway_test.npz"),
         "analysis": analysis,
         "scenario": analysis.scenarios[0],
         "checked logs": checked,
@@ -118,11 +117,11 @@ def test_no_repr_is_longer_than_ten_lines(things: Mapping[str, object]) -> None:
         ("trainer", "Trainer: epoch 0 of 3"),
         ("identification", "Identification of quadruped.urdf, 13 bodies, 12 joints, by consistent"),
         ("identification", "data        1250 samples of 1 log"),
-        ("identification", "total mass  21.431 ± 0.15 kg (URDF: 20.800 kg)"),
+        ("identification", "total mass  21.435 ± 0.15 kg (URDF: 20.800 kg)"),
         ("identification", "written to  no folder"),
-        ("body estimate", "± 0.026 kg m, identified"),
-        ("metrics", "Metrics: joint torque 0.0721 N m (6.8 %), base force 0.596 N (0.49 %), base moment 0.145 N m"),
-        ("evaluation", "sway_test: joint torque 0.0721 against 0.362 N m"),
+        ("body estimate", "± 0.025 kg m, identified"),
+        ("metrics", "Metrics: joint torque 0.0725 N m (6.8 %), base force 0.616 N (0.51 %), base moment 0.146 N m"),
+        ("evaluation", "sway_test: joint torque 0.0725 against 0.362 N m"),
         ("analysis", "cost 12"),
         ("checked logs", "2 logs checked, 2 usable"),
     ],

@@ -14,15 +14,14 @@ import yaml
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
-import mujoco
 from closed_loops import LoopWorld, loop_world
+from demo import NO_TERMS
 
 import torchid
 from torchid.cli import main
 from torchid.config import load_config
 from torchid.errors import TorchidError
 from torchid.fitting.experiment import set_up
-from torchid.logs import Log
 from torchid.reading.log_reader import LogReader
 from torchid.regressor.loops import LoopClosures
 from torchid.report import identified_urdf
@@ -30,26 +29,6 @@ from torchid.report.mjcf_files import mjcf_of_urdf
 from torchid.robot import Loop, load_robot
 
 LEG = "four-bar leg"
-
-
-MOTORS = ("abduction", "hip", "crank")
-
-
-def swing(path: Path, seconds: float, seed: int) -> Log:
-    """What motors record of a leg that follows sines by a PD law, with noise: positions and torques at 500 Hz."""
-    model, rng = mujoco.MjModel.from_xml_path(str(path)), np.random.default_rng(seed)
-    model.dof_solref[:] = [0.004, 1.0]
-    data = mujoco.MjData(model)
-    at, rate = (np.array([getattr(model.joint(name), key)[0] for name in MOTORS]) for key in ("qposadr", "dofadr"))
-    hz, phase, size = (rng.uniform(low, high, (3, 3)) for low, high in ((0.2, 1.5), (0.0, 6.3), (0.05, 0.15)))
-    time, rows = 0.001 * np.arange(round(1000 * seconds)), []
-    for now in time:
-        goal = (size * np.sin(2.0 * np.pi * hz * now + phase)).sum(0) * min(1.0, now / 2.0)
-        data.ctrl[:] = 60.0 * (goal - data.qpos[at]) - 2.0 * data.qvel[rate]
-        rows.append([*data.qpos[at], *data.ctrl])
-        mujoco.mj_step(model, data)
-    recorded = np.array(rows)[::2] + np.repeat([1e-5, 0.05], 3) * rng.normal(size=(len(time[::2]), 6))
-    return Log(f"swing {seed}", time[::2], MOTORS, recorded[:, :3], joint_torque=recorded[:, 3:])
 
 
 def experiment(folder: Path, w: LoopWorld, **robot: Any) -> Path:
@@ -68,6 +47,7 @@ def experiment(folder: Path, w: LoopWorld, **robot: Any) -> Path:
         "contacts": [{"frame": contact.frame, "type": contact.kind} for contact in w.contacts],
         "logs": {"train": ["train.npz"], "test": ["test.npz"]},
         "sensors": "full",
+        "actuators": NO_TERMS,
         "estimator": {"name": "least_squares", "ridge": 1e-12},
         "output": str(folder / "run"),
     }

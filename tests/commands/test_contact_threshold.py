@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from demo import DEMO
+from demo import DEMO, NO_TERMS
 from motions import value
 from refusals import refusal, refused
+from run_folders import document, identified
 
 from torchid.cli import main
 from torchid.commands.check import check_experiment
@@ -46,7 +46,7 @@ def experiment(
     settings["robot"]["urdf"] = str(DEMO / "quadruped.urdf")
     settings["estimator"]["ridge"] = 0.01
     settings["preprocessing"] |= {"contact_margin_s": 0.02} | preprocessing
-    settings |= {"sensors": FULL, "output": str(folder / "run")}
+    settings |= {"sensors": FULL, "actuators": NO_TERMS, "output": str(folder / "run")}
     (folder / "run.yaml").write_text(yaml.safe_dump(settings))
     return folder / "run.yaml"
 
@@ -57,21 +57,17 @@ def samples_of(file: Path) -> Samples:
     return LogReader(setup).read(setup.config.logs.train, setup.sensors)[0]
 
 
-def fit_of(run: Path) -> Any:
-    return json.loads((run / "parameters.json").read_text())
-
-
 @pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """The fit with the simulator's flags."""
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run with the simulator's flags."""
     folder = tmp_path_factory.mktemp("simulated")
     assert main(["identify", str(experiment(folder, change=lambda log: log))]) == 0
-    return fit_of(folder / "run")
+    return folder / "run"
 
 
-def test_a_fit_without_flags_is_that_with_the_same_flags(tmp_path: Path, simulated: Any) -> None:
+def test_a_fit_without_flags_is_that_with_the_same_flags(tmp_path: Path, simulated: Path) -> None:
     assert main(["identify", str(experiment(tmp_path, ".csv", contact_threshold=TOUCH))]) == 0
-    assert fit_of(tmp_path / "run") == simulated
+    assert document(tmp_path / "run", "parameters") == document(simulated, "parameters")
 
 
 def test_wrong_flags_are_replaced_and_not_rejected(tmp_path: Path) -> None:
@@ -113,15 +109,10 @@ def drifted(log: Log, size: float = 10.0) -> Log:
     return replace(log, contact_wrench_local=value(log.contact_wrench_local) + offset)
 
 
-def parameters_of(fit: Any) -> Any:
-    return [list(one["identified"].values()) for one in fit["bodies"]]
-
-
-def test_a_fit_of_zeroed_sensors_is_that_of_sensors_without_offsets(tmp_path: Path, simulated: Any) -> None:
+def test_a_fit_of_zeroed_sensors_is_that_of_sensors_without_offsets(tmp_path: Path, simulated: Path) -> None:
     file = experiment(tmp_path, change=drifted, zero_in_air=True)
     assert main(["identify", str(file)]) == 0
-    found, expected = parameters_of(fit_of(tmp_path / "run")), parameters_of(simulated)
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(identified(tmp_path / "run"), identified(simulated), rtol=0.0, atol=1e-9)
 
 
 def test_offsets_have_one_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -24,17 +23,6 @@ BAGS = (".bag", ".mcap", ".db3")
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return shortened_demo(tmp_path_factory.mktemp("demo") / "demo", 300)
-
-
-def identified(folder: Path, name: str, **logs: Any) -> dict[str, Any]:
-    """Every identified parameter, by body and name."""
-    settings = yaml.safe_load((folder / "quadruped.yaml").read_text())
-    settings["logs"] |= logs
-    settings["output"] = str(folder / "runs" / name)
-    (folder / f"{name}.yaml").write_text(yaml.safe_dump(settings))
-    assert main(["identify", str(folder / f"{name}.yaml")]) == 0
-    bodies = json.loads((folder / "runs" / name / "parameters.json").read_text())["bodies"]
-    return {f"{body['name']} {key}": x for body in bodies for key, x in body["identified"].items()}
 
 
 def logs_as(demo: Path, suffix: str) -> dict[str, Any]:

@@ -20,7 +20,7 @@ KP = 20.0
 def commanded(folder: Path, shape: tuple[int, float] = (6, 0.4), **settings: object) -> Path:
     """An experiment of logs that have no torques but gains and desired positions."""
     robot, _ = arm()
-    for name, seconds in (("train", 8.0), ("new", 4.0)):
+    for name, seconds in (("train", 5.0), ("new", 2.5)):
         log = recorded(seconds=seconds, shape=shape)
         q, torque = value(log.joint_position), value(log.joint_torque)
         fields = {"time": log.time, "joint_names": list(robot.joint_names), "dof_pos": q, "target": q + torque / KP}

@@ -23,7 +23,7 @@ from torchid.config import inputs_of, load_analysis, load_config, load_simulatio
 WITHOUT_EXTRAS = """
 import sys
 
-extras = ["h5py", "pyarrow", "rosbags", "mcap", "lz4", "zstandard", "mujoco"]
+extras = ["h5py", "pyarrow", "rosbags", "mcap", "lz4", "zstandard", "mujoco", "numba"]
 sys.modules.update(dict.fromkeys(extras))
 from torchid.cli import main
 
@@ -32,6 +32,7 @@ sys.exit(main(["demo", "estimator.ridge=0.1"]))
 SETS = ("full", "contacts", "joints", "reduced", "analysis")
 
 
+@pytest.mark.slow("a process of its own, which compiles the package")
 def test_the_demo_runs_without_extras_from_a_package_that_cannot_be_written(tmp_path: Path) -> None:
     """Of a copy of the package, in a process that sees no other and none of what the extras bring."""
     site, work = tmp_path / "site", tmp_path / "work"

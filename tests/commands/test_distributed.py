@@ -18,7 +18,7 @@ import torch.distributed as dist  # noqa: TID251
 import yaml
 from demo import shortened_demo
 from repository import DEMO
-from run_folders import names_in
+from run_folders import identified, names_in
 from shared_work import (
     SMALL_CHUNK,
     TWO,
@@ -37,16 +37,13 @@ from torchid import distributed
 from torchid.cli import main
 from torchid.commands.folder import CHECKPOINT
 from torchid.parallel import share_between_processes
-from torchid.parameters import Array
 from torchid.problem.linear import parameter_scale
 
-FINISHED = ("estimator.name=sgd", "estimator.training.epochs=4", "estimator.ridge=0.1")
-DESCENT = (*FINISHED, "estimator.training.finish=false")
+DESCENT = ("estimator.name=sgd", "estimator.training.epochs=4", "estimator.ridge=0.1")
 RUNS = {
     "biped, consistent": ("biped", ("estimator.name=consistent",)),
     "arm, robust": ("arm", ("estimator.robust=tukey",)),
     "quadruped, descent": ("quadruped", DESCENT),
-    "quadruped, descent to its end": ("quadruped", FINISHED),
     "short": ("short", ()),
 }
 
@@ -82,11 +79,6 @@ def runs(experiments: dict[str, Path], tmp_path_factory: pytest.TempPathFactory)
     return out
 
 
-def identified(run: Path) -> Array:
-    bodies = json.loads((run / "parameters.json").read_text())["bodies"]
-    return np.array([[*body["identified"].values()] for body in bodies])
-
-
 def in_scale(run: Path, other: Path, urdf: Path, bolted: bool) -> float:
     """Largest difference of the parameters of two runs, in units of their scale."""
     robot = torchid.load_robot(urdf, fixed_base=bolted)
@@ -113,7 +105,7 @@ def test_two_processes_find_what_one_finds(runs: dict[int, Path], experiments: d
     assert_same(runs[2] / name, runs[1] / name, experiments[RUNS[name][0]], "descent" in name)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_same_number_of_processes_gives_the_same_bits(
     runs: dict[int, Path], experiments: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -125,7 +117,7 @@ def test_the_same_number_of_processes_gives_the_same_bits(
         ).read_bytes()
 
 
-@pytest.mark.parametrize(("sizes", "size"), [([5] * 7, 3), ([1, 9, 1, 9], 2), ([3], 4), ([], 2), ([2048] * 9 + [3], 4)])
+@pytest.mark.parametrize(("sizes", "size"), [([1, 9, 1, 9], 2), ([3], 4), ([], 2), ([2048] * 9 + [3], 4)])
 def test_every_piece_has_one_owner_and_shares_are_even(
     monkeypatch: pytest.MonkeyPatch, sizes: list[int], size: int
 ) -> None:
@@ -158,7 +150,7 @@ def test_a_mistake_that_all_see_is_told_once(tmp_path: Path) -> None:
 @pytest.fixture
 def two_machines(tmp_path: Path) -> tuple[Path, Path]:
     """Folders in which two processes work, as machines without a common disk do."""
-    return shortened_demo(tmp_path / "first", 300), shortened_demo(tmp_path / "second", 300)
+    return shortened_demo(tmp_path / "first", 100), shortened_demo(tmp_path / "second", 100)
 
 
 def identified_on(machines: tuple[Path, Path]) -> tuple[int, str, str]:
@@ -197,7 +189,7 @@ def test_machines_with_other_logs_are_told_apart(two_machines: tuple[Path, Path]
     )
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_an_evaluation_is_that_of_one_process(
     runs: dict[int, Path], experiments: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -242,7 +234,7 @@ def test_processes_share_items_as_forks_would_and_the_first_alone_says_things(tm
     assert (first["said"], second["said"]) == (["four"], [])
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_torchrun_starts_again_where_a_training_was(runs: dict[int, Path], experiments: dict[str, Path]) -> None:
     """As `--resume`: the same bits as without the interruption."""
     folder: Path = runs[2].parent / "again"

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from demo import NO_TERMS
 from misread import WIDTH, World, with_actuators
 from recordings import Miscalibration
-from repository import DEMO
 from rich.progress import Progress
 from synthetic import Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES, machine
@@ -34,7 +34,7 @@ def files(folder: Path, deviation: float) -> tuple[Path, dict[tuple[str, str], f
     if deviation:
         oracle.perturb(rng, deviation)
     contacts = [(contact.frame, len(contact.components)) for contact in CONTACTS]
-    logs = [make_log(oracle, contacts, STATES, 80, rng, f"{name}.npz") for name in ("first", "second", "new")]
+    logs = [make_log(oracle, contacts, STATES, 40, rng, f"{name}.npz") for name in ("first", "second", "new")]
     ideal = [
         Miscalibration(*(np.full(shape, x) for shape in ((robot.n,), (3, 6), (len(SENSORS), 6)) for x in (0.0, 1.0)))
     ] * 3
@@ -49,7 +49,7 @@ def files(folder: Path, deviation: float) -> tuple[Path, dict[tuple[str, str], f
                      {"frame": "fin", "type": "line", "line_axis": "z"}],
         "logs": {"train": ["first.npz", "second.npz"]},
         "sensors": {"set": "full", "ft_sensors": list(SENSORS), "offsets": "log"},
-        "actuators": {"armature": True, "asymmetric_coulomb": True, "sign_width": WIDTH},
+        "actuators": NO_TERMS | {"armature": True, "asymmetric_coulomb": True, "sign_width": WIDTH},
         "estimator": {"name": "least_squares", "ridge": 0.0},
         "output": str(folder / "run"),
     }  # fmt: skip
@@ -101,6 +101,7 @@ def test_a_run_through_files_finds_them_and_another_log_is_predicted_with_them(r
     assert min(errors_in(found["nominal"]).values()) > 1e-2
 
 
+@pytest.mark.slow("two fits with bounds, of offsets of every log")
 def test_actuators_that_cannot_be_stand_on_their_bounds_and_are_named(
     run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,16 +141,13 @@ def test_actuators_that_cannot_be_stand_on_their_bounds_and_are_named(
     assert -found["value"] == pytest.approx(resisting, abs=1e-4)
 
 
+@pytest.mark.slow("a search of the width")
 def test_the_width_of_the_sign_is_found_where_friction_does_not_reverse_at_once(run: Run) -> None:
-    """Everything else is fitted anew for each width. Friction of the demo goes with the sign itself."""
-    demo = [f"logs.train=['{DEMO / 'sway_train.npz'}[:6]']"]
-    widths = []
-    for file, more in ((run.file, []), (DEMO / "quadruped.yaml", demo)):
-        setup = set_up(load_config(file, ["actuators.sign_width=auto", *more]))
-        choice = with_chosen_settings(setup, Progress(disable=True))[1].sign_width
-        assert choice is not None
-        widths.append(choice.width)
-    assert widths == [pytest.approx(WIDTH, rel=2e-3), None]
+    """Everything else is fitted anew for each width."""
+    setup = set_up(load_config(run.file, ["actuators.sign_width=auto"]))
+    choice = with_chosen_settings(setup, Progress(disable=True))[1].sign_width
+    assert choice is not None
+    assert choice.width == pytest.approx(WIDTH, rel=2e-3)
 
 
 def test_a_urdf_that_is_right_has_no_errors_whatever_the_offsets(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:.*in the air:torchid.errors.TorchidWarning"),
 ]
 SAME = 1e-12
-KEPT = 350  # of 400 samples: the filter leaves out what it cannot see both sides of
+KEPT = 150  # of 200 samples: the filter leaves out what it cannot see both sides of
 OFFSETS = {"set": "full", "offsets": "log"}
 
 
@@ -65,13 +65,12 @@ def assert_same(logs: Identification, factors: Identification) -> None:
     "overrides",
     [
         (),
-        ("estimator={name: consistent, ridge: auto}",),
-        pytest.param(("estimator={name: consistent, ridge: 0.001}",), marks=pytest.mark.slow),
+        pytest.param(("estimator={name: consistent, ridge: auto}",), marks=pytest.mark.slow("a search of the ridge")),
     ],
-    ids=["least squares", "ridge auto", "consistent"],
+    ids=["least squares", "ridge auto"],
 )
 def test_the_demo_from_its_factor_is_the_demo_from_its_log(tmp_path: Path, overrides: tuple[str, ...]) -> None:
-    logs, factors = fitted_twice(shortened_demo(tmp_path / "demo", 1_300) / "quadruped.yaml", *overrides)
+    logs, factors = fitted_twice(shortened_demo(tmp_path / "demo", 600) / "quadruped.yaml", *overrides)
     assert_same(logs, factors)
     assert (logs.ridge is None) == (factors.ridge is None)
     if logs.ridge is not None and factors.ridge is not None:
@@ -86,18 +85,10 @@ def test_the_demo_from_its_factor_is_the_demo_from_its_log(tmp_path: Path, overr
 @pytest.mark.parametrize(
     ("machine", "seconds", "settings"),
     [
-        pytest.param("arm", (6.0,), {}, marks=pytest.mark.slow),
-        ("arm", (3.0, 4.0, 3.0), {"actuators": {"armature": True, "torque_offset": True}}),
-        ("biped", (2.0, 2.0), {"sensors": OFFSETS}),
-        pytest.param(
-            *("biped", (8.0, 2.0, 2.0), {"sensors": OFFSETS, "estimator": {"name": "consistent", "ridge": 1e-3}}),
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            *("biped", (4.0, 3.0, 6.0), {"sensors": OFFSETS, "estimator": {"ridge": "auto"}}), marks=pytest.mark.slow
-        ),
+        ("arm", (2.0, 2.5, 2.0), {"actuators": {"armature": True, "torque_offset": True}}),
+        pytest.param("biped", (2.0, 2.0), {"sensors": OFFSETS}, marks=pytest.mark.slow("offsets of every log")),
     ],
-    ids=["arm", "arm, actuators", "biped", "biped, consistent", "biped, ridge auto"],
+    ids=["arm, actuators", "biped"],
 )
 def test_several_logs_from_their_factors_are_fitted_as_from_the_logs(
     tmp_path: Path, machine: str, seconds: tuple[float, ...], settings: dict[str, Any]
@@ -108,9 +99,6 @@ def test_several_logs_from_their_factors_are_fitted_as_from_the_logs(
     assert logs.noise.noise == factors.noise.noise
     assert [one.origin for one in logs.noise.groups] == [one.origin for one in factors.noise.groups]
     assert logs.misfit.expected is factors.misfit.expected is None
-    assert (logs.ridge is None) == (factors.ridge is None)
-    if logs.ridge is not None and factors.ridge is not None:
-        assert factors.ridge.ridge == logs.ridge.ridge
 
 
 # ------------------------------------------------------------------------------------------------ what a run says then
@@ -121,6 +109,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return demo_fleet(tmp_path_factory.mktemp("fleet") / "demo")
 
 
+@pytest.mark.slow("searches of a cutoff, a velocity and a tilt")
 def test_what_was_left_to_the_logs_is_printed_and_taken_from_their_factors(
     fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -153,10 +142,6 @@ def test_the_table_of_files_says_what_is_in_them(
     ]
     assert lines[0] == f"2 logs, {2 * KEPT} samples, in {sum(sizes.values()) / 1e6:.3g} MB of factors"
     assert cells in [line.split() for line in lines]
-    assert main([*line, "overwrite=true", "--verbose"]) == 0
-    verbose = capsys.readouterr().out.splitlines()
-    assert verbose[0].startswith("Contact states")
-    assert set(lines) < set(verbose)
 
 
 def test_a_file_reads_back_to_the_last_bit(fleet: Path, tmp_path: Path) -> None:
@@ -179,12 +164,8 @@ def test_a_file_is_written_whole_or_not_at_all(fleet: Path, tmp_path: Path, monk
     with pytest.raises(KeyboardInterrupt):
         write_factors(tmp_path / "a.factor", found)
     with pytest.raises(KeyboardInterrupt):
-        main_compress(fleet, tmp_path / "f")
+        compressed(fleet / "logs.yaml", tmp_path / "f")
     assert list(tmp_path.iterdir()) == []
-
-
-def main_compress(fleet: Path, output: Path) -> None:
-    compressed(fleet / "logs.yaml", output)
 
 
 def test_only_factor_files_are_written_and_read(fleet: Path, tmp_path: Path) -> None:

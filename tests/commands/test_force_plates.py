@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from demo import NO_TERMS
 from large import SMALL
 from motions import value
-from plates import LABORATORIES, centres_of_pressure, plates_csv, walk, write_motion
-from raw_logs import write_arrays
+from plates import LABORATORIES, walk, write_motion
 from refusals import refusal
 from repository import SHARED
-from scipy.spatial.transform import Rotation
 from simulated import BIPED, feet_of
-from thinned import slow_but
 
 from torchid.cli import main
 from torchid.logs import Log, read_log, write_log
@@ -31,9 +29,10 @@ def experiment(folder: Path, log: str, columns: str | None = None, **preprocessi
     settings = {
         "robot": {"urdf": str(BIPED)},
         "contacts": [{"frame": "l_sole", "type": "flat"}, {"frame": "r_sole", "type": "flat"}],
-        "logs": {"train": [f"{log}[0:2]"], "test": [f"{log}[2:]"]}
+        "logs": {"train": [f"{log}[0:1.2]"], "test": [f"{log}[1.2:]"]}
         | ({"columns": yaml.safe_load(columns)} if columns else {}),
         "sensors": "full",
+        "actuators": NO_TERMS,
         "estimator": {"name": "least_squares", "ridge": 1e-3},
         "preprocessing": preprocessing,
         "output": str(folder / "run"),
@@ -56,7 +55,7 @@ def identified(file: Path, *overrides: str) -> tuple[np.ndarray, dict[str, float
 def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, dict[str, float]]:
     """What wrenches at the soles give."""
     folder = tmp_path_factory.mktemp("soles")
-    write_log(walk(), folder / "walk.npz")
+    write_log(walk(2.0), folder / "walk.npz")
     return identified(experiment(folder, "walk.npz"))
 
 
@@ -68,71 +67,50 @@ def recorded(folder: Path, laboratory: str, log: Log) -> str:
     return text
 
 
-@pytest.mark.parametrize("laboratory", slow_but(["plates", "OpenSim"], LABORATORIES))
+@pytest.mark.parametrize("laboratory", ["plates", "OpenSim"])
 def test_a_fit_to_plates_is_that_to_wrenches_at_the_soles(
     laboratory: str, tmp_path: Path, expected: tuple[np.ndarray, dict[str, float]]
 ) -> None:
-    text = recorded(tmp_path, laboratory, walk())
+    text = recorded(tmp_path, laboratory, walk(2.0))
     parameters, errors = identified(experiment(tmp_path, MOTION, text))
     assert np.abs(parameters - expected[0]).max() < 1e-9 * np.abs(expected[0]).max()
     assert errors == pytest.approx(expected[1], rel=1e-9)
 
 
+@pytest.mark.slow("four fits")
 def test_a_converted_log_is_fitted_block_by_block_compressed_checked_and_judged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], expected: tuple[np.ndarray, dict[str, float]]
 ) -> None:
-    text = recorded(tmp_path, "plates", walk())
+    text = recorded(tmp_path, "plates", walk(2.0))
     file, log = experiment(tmp_path, "walk.parquet", text), str(tmp_path / "walk.parquet")
     assert main(["convert", str(tmp_path / MOTION), log, "--columns", str(file)]) == 0
     parameters, _ = identified(file, SMALL)
     assert np.abs(parameters - expected[0]).max() < 1e-9 * np.abs(expected[0]).max()
     assert main(["compress", str(file), "--output", str(tmp_path / "factors")]) == 0
-    factor = str(tmp_path / "factors" / "walk[0:2].factor")
+    factor = str(tmp_path / "factors" / "walk[0:1.2].factor")
     of_factor, _ = identified(file, f"logs.train=['{factor}']")
     assert np.abs(of_factor - parameters).max() < 1e-9 * np.abs(parameters).max()
-    assert main(["evaluate", str(tmp_path / "run"), "--log", f"{log}[2:]"]) == 0
+    assert main(["evaluate", str(tmp_path / "run"), "--log", f"{log}[1.2:]"]) == 0
     capsys.readouterr()
     assert main(["check", log, "--urdf", str(BIPED)]) in (0, 1)
     assert "point" not in capsys.readouterr().out
 
 
-def table(folder: Path) -> Path:
-    """One table of motion and plates."""
-    motion, plates = (write_motion(folder / "motion.csv", walk()), folder / "plates.csv")
-    plates_csv(plates, walk())
-    rows = [both for both in zip(*(x.read_text().splitlines() for x in (motion, plates)), strict=True)]
-    (folder / "both.csv").write_text("\n".join(f"{a},{b.partition(',')[2]}" for a, b in rows) + "\n")
-    return folder / "both.csv"
-
-
-def arrays(folder: Path) -> Path:
-    """One file of arrays, with centres of pressure on plates that are turned and shifted."""
-    with np.load(write_motion(folder / "motion.npz", walk())) as motion:
-        known = dict(motion)
-    points, free = centres_of_pressure(walk())
-    into, force = Rotation.from_euler("z", -30.0, degrees=True), value(walk().contact_wrench_world)[..., :3]
-
-    def turned(vectors: np.ndarray) -> np.ndarray:
-        return into.apply(vectors.reshape(-1, 3)).reshape(vectors.shape)
-
-    known |= {"grf": turned(force), "cop": 100.0 * turned(points - [1.0, 2.0, 3.0]), "free_moment": free[..., None]}
-    return write_arrays(folder / "both.h5", known)
-
-
 def test_plates_without_a_pose_in_their_world_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = recorded(tmp_path, "OpenSim", walk())
+    text = recorded(tmp_path, "OpenSim", walk(2.0))
     file = experiment(tmp_path, MOTION, text, base_motion="contacts")
     assert "contact_wrench_world: given, but preprocessing.base_motion: contacts knows no" in refusal(
         ["identify", str(file)], tmp_path, capsys
     )
     with np.load(tmp_path / "motion.npz") as arrays:
         rest = {name: x for name, x in arrays.items() if name != "base_position_world"}
-    velocity = np.gradient(value(walk().base_position_world), walk().time, axis=0)
+    velocity = np.gradient(value(walk(2.0).base_position_world), walk(2.0).time, axis=0)
     np.savez(tmp_path / "motion.npz", base_linear_velocity_world=velocity, **rest)
     complaint = refusal(["identify", str(experiment(tmp_path, MOTION, text))], tmp_path, capsys)
     assert "contact_wrench_point_world: given without base_position_world" in complaint
 
 
+@pytest.mark.slow("a recording of a person")
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded logs (../shared/data) are not here")
 def test_a_plate_that_lies_elsewhere_is_noticed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A person on two plates, said to be 10 cm from where they are."""

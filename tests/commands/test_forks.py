@@ -92,10 +92,11 @@ def test_forks_make_no_forks() -> None:
         assert fork.result()
 
 
+@pytest.mark.slow("a command in a process of its own, which draws all figures")
 def test_a_command_in_its_own_process_writes_the_files_that_it_writes_without_forks(
     tmp_path: Path, figures: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    settings, override = str(shortened_demo(tmp_path / "demo", 400) / "quadruped.yaml"), "estimator.ridge=auto"
+    settings, override = str(shortened_demo(tmp_path / "demo", 200) / "quadruped.yaml"), "estimator.ridge=auto"
     assert main(["identify", settings, override, f"output={tmp_path / 'alone'}", "--quiet"]) == 0
     command = [sys.executable, "-m", "torchid", "identify", settings, override, f"output={tmp_path / 'forks'}", "-q"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from demo import FAST_ESTIMATOR
+from demo import shortened_demo
 from loadable import assert_loads
 from repository import CONFIGS, DEMO, SHARED
 from run_figures import OF_A_RUN
-from run_folders import names_in
 from synthetic import Oracle, random_states
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -27,36 +26,18 @@ from torchid.estimators.least_squares import VERDICTS
 from torchid.parameters import PARAMETERS
 from torchid.report import identified_urdf
 
-pytestmark = pytest.mark.usefixtures("events")
-
-FAST = f"estimator={json.dumps(FAST_ESTIMATOR)}"
 UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    output = tmp_path_factory.mktemp("runs") / "demo"
-    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={output}"]) == 0
-    return output
+@pytest.fixture
+def run(demo_run: Path) -> Path:
+    return demo_run
 
 
 def test_a_run_folder_holds_what_it_promises(run: Path) -> None:
     names = {path.name.split(".")[0] for path in run.iterdir()}
-    assert names >= {
-        "config",
-        "parameters",
-        "metrics",
-        "identified",
-        "events",
-        "forces",
-        "pressure",
-        "rows",
-        "spectra",
-        "errors",
-        "identifiability",
-        "inertia",
-    }
-    assert names_in(run.parent) == [run.name], "temporary folders left behind"
+    assert names >= {"config", "parameters", "metrics", "identified", "events", *OF_A_RUN}
+    assert [path for path in run.parent.iterdir() if path.name.startswith(".")] == [], "temporary folders left behind"
 
 
 def test_simulators_take_the_robot_that_a_run_writes(run: Path) -> None:
@@ -134,16 +115,18 @@ def test_tensorboard_shows_train_and_test_before_and_after(run: Path) -> None:
     assert values == pytest.approx([mass["total_mass"] + k * error for k in (-1, 0, 1)])
 
 
-def test_evaluating_the_test_log_again_gives_the_same_figures(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", str(run), "--log", str(DEMO / "sway_test.npz")]) == 0
+def test_evaluating_the_test_log_again_gives_the_same_figures(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", str(run), "--log", str(DEMO / "sway_test.npz"), "--output", str(tmp_path / "again")]) == 0
     assert "sway_test" in capsys.readouterr().out
-    found = json.loads((run / "evaluation" / "sway_test" / "metrics.json").read_text())["sway_test"]
+    found = json.loads((tmp_path / "again" / "metrics.json").read_text())["sway_test"]
     expected = json.loads((run / "metrics.json").read_text())
     assert found["identified"] == expected["test"]
     assert found["nominal"]["base_force_rms"] == pytest.approx(expected["test_nominal"]["base_force_rms"])
 
 
-@pytest.mark.parametrize("damage", [("NaN", "m"), ("true", "Ixx"), ('"1.0"', "fv")], ids=["NaN", "flag", "text"])
+@pytest.mark.parametrize("damage", [("NaN", "m"), ('"1.0"', "fv")], ids=["NaN", "text"])
 def test_parameters_that_are_no_numbers_are_not_evaluated(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: tuple[str, str]
 ) -> None:
@@ -158,22 +141,19 @@ def test_parameters_that_are_no_numbers_are_not_evaluated(
     assert document["bodies"][3]["name"] in printed
 
 
-@pytest.mark.parametrize("noise", [(), ("sensors.noise={}",)], ids=["stated", "estimated"])
-def test_torques_of_no_robot_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], noise: tuple[str, ...]
-) -> None:
+@pytest.mark.slow("a search for the mistake")
+def test_torques_of_no_robot_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     demo_with(tmp_path / "demo", joint_torque=lambda torque: 50.0 * rng.normal(size=torque.shape))
-    file, output = tmp_path / "demo" / "quadruped.yaml", tmp_path / "run"
-    assert main(["identify", str(file), f"output={output}", FAST, *noise]) == 2
-    assert "the fit leaves 9" in capsys.readouterr().err.splitlines()[-1]
-    assert not output.exists()
+    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), f"output={tmp_path / 'run'}"]) == 2
+    assert "the fit leaves " in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "run").exists()
 
 
 def demo_with(folder: Path, **changes: Callable[[Any], Any]) -> None:
-    """The demo with fields of its training log changed."""
-    shutil.copytree(DEMO, folder)
-    with np.load(DEMO / "sway_train.npz") as log:
+    """The demo, shortened, with fields of its training log changed."""
+    shortened_demo(folder, 400)
+    with np.load(folder / "sway_train.npz") as log:
         fields = dict(log)
     np.savez(folder / "sway_train.npz", **fields | {name: change(fields[name]) for name, change in changes.items()})
 
@@ -196,6 +176,7 @@ def test_identified_urdf_moves_as_its_parameters_say(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded human squats (../shared/data) are not here")
 @pytest.mark.filterwarnings(UNPHYSICAL)
+@pytest.mark.slow("recordings of a person, as configs/human_squats.yaml fits them")
 def test_force_plates_alone_identify_a_person_who_then_squats_differently(tmp_path: Path) -> None:
     """The ridge was chosen by leaving blocks of the training log out (see configs/human_squats.yaml)."""
     config = CONFIGS / "human_squats.yaml"
@@ -217,7 +198,7 @@ def test_logs_of_one_name_are_not_evaluated_as_one(run: Path, capsys: pytest.Cap
 
 def test_positions_in_degrees_stop_a_run_that_names_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     demo_with(tmp_path / "demo", joint_position=np.rad2deg)
-    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), FAST]) == 2
+    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml")]) == 2
     told = capsys.readouterr().err.splitlines()[-1]
     assert "torchid check finds in sway_train.npz: joint_position: " in told
     assert "degrees?; accepted: convert joint_position" in told

@@ -28,7 +28,7 @@ NAME = "motion.npz + plates.npz@-3.0s + torques.npz"
 @pytest.fixture
 def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The demo with its training log in three files, of which the plates have a clock of their own."""
-    folder = shortened_demo(tmp_path / "demo", 600)
+    folder = shortened_demo(tmp_path / "demo", 300)
     with np.load(folder / "sway_train.npz") as log:
         for name, fields in FIELDS.items():
             shift = 3.0 if name == "plates" else 0.0
@@ -55,18 +55,18 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 def test_a_fit_of_several_files_is_that_of_the_whole_log(demo: Path) -> None:
-    whole = identified("runs/whole", ["sway_train.npz[:4]"], ["sway_train.npz[4:]"])
-    joined = identified("runs/joined", [JOINED | {"to": 4}], [JOINED | {"from": 4}])
+    whole = identified("runs/whole", ["sway_train.npz[:2]"], ["sway_train.npz[2:]"])
+    joined = identified("runs/joined", [JOINED | {"to": 2}], [JOINED | {"from": 2}])
     assert Path("runs/joined/parameters.json").read_bytes() == Path("runs/whole/parameters.json").read_bytes()
     for key in ("train", "test", "cross_validation", "samples", "rank"):
         assert joined[key] == whole[key], key
 
-    assert main(["evaluate", "runs/joined", "--log", f"{NAME}[4:]"]) == 0
-    name = "motion + plates + torques[4:]"
+    assert main(["evaluate", "runs/joined", "--log", f"{NAME}[2:]"]) == 0
+    name = "motion + plates + torques[2:]"
     evaluated = json.loads((demo / f"runs/joined/evaluation/{name}/metrics.json").read_text())
     for group, value in evaluated[name]["identified"].items():
         assert value == pytest.approx(joined["test"][group], rel=1e-9), group
-    assert load_config("runs/joined/config.yaml").logs.train == [demo / f"{NAME}[:4]"]
+    assert load_config("runs/joined/config.yaml").logs.train == [demo / f"{NAME}[:2]"]
 
 
 def test_several_files_are_checked_converted_and_compressed(demo: Path) -> None:
@@ -74,7 +74,7 @@ def test_several_files_are_checked_converted_and_compressed(demo: Path) -> None:
     whole, one = read_log("sway_train.npz"), read_log("one.h5")
     for name, x in whole.arrays().items():
         assert np.array_equal(x, one.arrays()[name], equal_nan=True), name
-    assert main(["check", f"{NAME}[1:5]", "--urdf", "quadruped.urdf"]) == 0
+    assert main(["check", f"{NAME}[0.5:2.5]", "--urdf", "quadruped.urdf"]) == 0
     train = f"logs.train={json.dumps([JOINED])}"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
@@ -91,11 +91,11 @@ def test_what_several_files_are_not_for_is_refused(demo: Path, capsys: pytest.Ca
 
 def test_no_sample_of_the_first_file_is_used_twice(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = "motion.npz + torques.npz + plates.npz@-3"
-    error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:4]', other + '[3:]'])}")
+    error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:2]', other + '[1:]'])}")
     assert "share samples; accepted: every sample once" in error
     train, test = (
-        f"logs.{name}={json.dumps([log])}" for name, log in (("train", NAME + "[:4]"), ("test", other + "[3:]"))
+        f"logs.{name}={json.dumps([log])}" for name, log in (("train", NAME + "[:2]"), ("test", other + "[1:]"))
     )
     fast = f"estimator={json.dumps(FAST_ESTIMATOR)}"
     assert main(["identify", "quadruped.yaml", train, test, fast, "output=runs/x"]) == 0
-    assert f"{other}[3:] is fitted on as well" in capsys.readouterr().err
+    assert f"{other}[1:] is fitted on as well" in capsys.readouterr().err

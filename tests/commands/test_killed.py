@@ -98,7 +98,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[list[str],
     """
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr("torchid.problem.chunks._LEAST", SMALL_CHUNK)
-        folder = shortened_demo(tmp_path_factory.mktemp("killed") / "demo", 500)
+        folder = shortened_demo(tmp_path_factory.mktemp("killed") / "demo", 200)
         command = ["identify", str(folder / "quadruped.yaml")]
         begin = time.monotonic()
         status, _, complained = finish_forked(2, lambda: main([*command, f"output={folder / 'run'}"]))
@@ -143,8 +143,8 @@ STARTING = 4.0
 @pytest.mark.parametrize(
     ("seed", "kill", "start"),
     [
-        (0, killed_fork_after, 0.0),
-        *(pytest.param(seed, killed_after, STARTING, marks=pytest.mark.slow) for seed in range(20)),
+        pytest.param(0, killed_fork_after, 0.0, marks=pytest.mark.slow("two processes, and two again")),
+        *(pytest.param(seed, killed_after, STARTING, marks=pytest.mark.study) for seed in range(20)),
     ],
 )
 def test_a_killed_process_ends_all_and_leaves_nothing_or_all(

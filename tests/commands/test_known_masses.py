@@ -1,4 +1,4 @@
-"""A mass that a scale has told fixes what torques alone leave open: by how much all their constants are off."""
+"""Scales of motors of one type, and what a known mass fixes where the constants of all motors are off."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from arms import ARMS
 from currents import HIP_SCALE, HIPS, KNEE_SCALE, KNEES, NOISE, quadruped_files
 from refusals import refusal
 from repository import SHARED
+from run_folders import document
 from synthetic import ROBOTS
 
 from torchid.cli import main
@@ -35,11 +36,7 @@ LABELS = ("scale of *_hip,*_thigh", "scale of *_knee")
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
     """An experiment file of a robot of which each type of motor has an unknown constant, and its mass [kg]."""
-    return quadruped_files(tmp_path_factory.mktemp("currents"), SCALES, sensors=SENSORS, estimator=EXACT)
-
-
-def document(run: Path, name: str) -> dict[str, Any]:
-    return dict(json.loads((run / f"{name}.json").read_text()))
+    return quadruped_files(tmp_path_factory.mktemp("currents"), SCALES, 100, sensors=SENSORS, estimator=EXACT)
 
 
 def scales_of(run: Path) -> dict[str, dict[str, Any]]:
@@ -50,9 +47,6 @@ def scales_of(run: Path) -> dict[str, dict[str, Any]]:
     ("std", "more", "tolerance"),
     [
         (0.0, ("estimator.ridge=auto",), 1e-7),
-        # 1.4e-3: the ridge holds all other parameters near the URDF
-        pytest.param(0.0, ("estimator.ridge=1e-3",), 3e-3, marks=pytest.mark.slow),
-        pytest.param(0.05, (), 1e-7, marks=pytest.mark.slow),
         (0.05, ("estimator.name=consistent", "estimator.ridge=1e-6"), 2e-4),
     ],
 )
@@ -106,7 +100,7 @@ def test_a_recorded_robot_that_stands_on_all_feet_is_refused_with_the_reason(
         "robot": {"urdf": str(ROBOTS / "go2_description/urdf/go2.urdf")},
         "contacts": [{"frame": foot, "type": "point", "radius": 0.022} for foot in feet],
         "logs": {
-            "train": [f"{SHARED / 'go2_standing' / 'log.npz'}[5:50]"],
+            "train": [f"{SHARED / 'go2_standing' / 'log.npz'}[5:15]"],
             "columns": {"joint_torque": "torque_estimate", "contact_active": {"always": feet}},
         },
         "preprocessing": {"cutoff_hz": 4, "base_motion": "contacts"},
@@ -197,3 +191,38 @@ def test_a_known_mass_is_as_well_known_where_other_rows_are_mostly_noise_of_the_
     errors = [combination_standard_error(x, LeastSquares().solve(x), total) for x in (problem, lacking, *known)]
     assert errors[1] > 2.0 * errors[0]
     assert errors[3] == pytest.approx(errors[2], rel=1e-9), "the row of the mass lacks nothing"
+
+
+# ------------------------------------------------------------------------------------------- one type of motor alone
+
+
+@pytest.fixture(scope="module")
+def grouped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Hips and thighs have motors whose constant is off, knees others that are right."""
+    scales = dict.fromkeys(HIPS, HIP_SCALE)
+    return quadruped_files(
+        tmp_path_factory.mktemp("currents"),
+        scales,
+        100,
+        sensors=SENSORS | {"scales": {"joint_torque": [HIPS]}},
+        estimator=EXACT,
+    )[0]
+
+
+def test_the_scale_of_a_type_of_motors_is_found_and_a_new_log_predicted_with_it(
+    grouped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = grouped.parent / "run"
+    assert main(["identify", "--verbose", str(grouped)]) == 0
+    (scale,) = document(run, "parameters")["extras"]
+    assert (scale["label"], scale["log"], scale["told_apart"]) == ("scale of *_hip,*_thigh", None, True)
+    assert scale["value"] == pytest.approx(HIP_SCALE - 1.0, rel=1e-7)
+    metrics = document(run, "metrics")
+    assert metrics["test"]["nullspace_rms"] < 1e-7
+    assert metrics["test_nominal"]["nullspace_rms"] > 0.1
+    printed = capsys.readouterr().out
+    assert "scale of *_hip,*_thigh" in printed
+    assert max(map(len, printed.splitlines())) <= 100
+    assert main(["evaluate", str(run), "--log", str(grouped.parent / "new.npz")]) == 0
+    (written,) = (run / "evaluation").rglob("metrics.json")
+    assert json.loads(written.read_text())["new"]["identified"]["nullspace_rms"] < 1e-7

@@ -19,7 +19,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from bags import entries_of, parsed, topics_of, write_bag
 from large import (
     SMALL,
     assert_same,
@@ -35,7 +34,6 @@ from torchid.cli import main
 from torchid.config import load_config
 from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import set_up
-from torchid.logs import read_log
 from torchid.logs.blocks import log_bytes, open_log_blocks
 from torchid.logs.lazy_arrays import Spill, SpillError
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
@@ -54,7 +52,7 @@ def fitted(file: Path, *more: str) -> np.ndarray:
 
 
 def test_the_parameters_are_the_same(tmp_path: Path) -> None:
-    file = experiment(tmp_path, recorded(9_000), ".h5")
+    file = experiment(tmp_path, recorded(5_000), ".h5")
     whole, large = fitted(file), fitted(file, SMALL)
     np.testing.assert_allclose(large, whole, rtol=1e-9, atol=1e-10 * np.abs(whole).max())
 
@@ -126,19 +124,6 @@ def test_a_table_takes_one_file_for_each_field_however_many_batches_it_is_read_i
         assert len(made_in) == 1 + len(blocks.fields), "time too"
 
 
-@pytest.mark.filterwarnings("ignore:.*no stamps in the messages")
-def test_bags_take_memory_too(tmp_path: Path) -> None:
-    file = experiment(tmp_path, recorded(200))
-    log = read_log(tmp_path / "log.npz")
-    write_bag(tmp_path / "log.mcap", entries_of(log))
-    setup, size = set_up(load_config(file, overrides({}))), log_bytes(tmp_path / "log.npz", 0.0)
-    settings = replace(setup.config.preprocessing, memory_gb=1e-9 * size)
-    logs = replace(setup.config.logs, topics=parsed(topics_of(log)))
-    reader = LogReader(replace(setup, config=replace(setup.config, preprocessing=settings, logs=logs)))
-    found = reader.read([tmp_path / name for name in ("log.mcap", "log.mcap")], None)
-    assert [is_on_disk(samples) for samples in found] == [False, True]
-
-
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_an_evaluation_keeps_large_logs_beside_the_run_wherever_that_was_moved_to(
     tmp_path: Path, made_in: list[str]
@@ -185,7 +170,7 @@ def small_disk() -> Any:
 def test_a_full_disk_is_one_line_that_says_where_and_what_would_help(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
 ) -> None:
-    file = experiment(tmp_path, recorded(9_000), ".h5")
+    file = experiment(tmp_path, recorded(4_000), ".h5")
     request.getfixturevalue("small_disk")
     line = refusal(["identify", str(file), SMALL, f"output={tmp_path / 'new' / 'run'}"], tmp_path, capsys)
     assert f"temporary file in {tmp_path}: cannot be written" in line
@@ -214,8 +199,9 @@ def test_an_array_grows_by_rows_on_the_disk(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.slow("a command in a process of its own")
 def test_an_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
-    file = experiment(tmp_path, recorded(40_000), ".h5")
+    file = experiment(tmp_path, recorded(20_000), ".h5")
     command = [sys.executable, "-m", "torchid", "identify", str(file), SMALL, f"output={tmp_path / 'run'}"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     descriptors = Path(f"/proc/{process.pid}/fd")
@@ -266,6 +252,7 @@ print(json.dumps({"peak": max(peak) - before, "bytes": size / 2**20}))
 """
 
 
+@pytest.mark.slow("a log of 40 MB in a process of its own")
 def test_memory_is_bounded_by_the_limit_and_not_by_the_log(tmp_path: Path) -> None:
     file = experiment(tmp_path, recorded(60_000), ".h5")
     command = [sys.executable, "-c", READ, str(file), *overrides({"cutoff_hz": 20}), "preprocessing.memory_gb=0.02"]

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 from bags import entries_of, topics_of, write_bag
+from demo import NO_TERMS
 from dialects import ORDER, with_velocity
 from low_states import TOPIC, float32, low_states
 from repository import DEMO
@@ -28,6 +29,7 @@ def test_a_fit_is_that_on_the_same_log_in_the_format(tmp_path: Path) -> None:
     write_log(without_imu, tmp_path / "x.npz")
     settings = yaml.safe_load((DEMO / "quadruped.yaml").read_text())
     settings["robot"]["urdf"] = str(DEMO / "quadruped.urdf")
+    settings["actuators"] = NO_TERMS
     settings["estimator"] = {"name": "least_squares", "ridge": 0.01}
     found = {}
     for file in (path, tmp_path / "x.npz"):

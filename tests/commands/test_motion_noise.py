@@ -25,38 +25,36 @@ from torchid.reading.log_reader import LogReader
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo with encoders that are noisy by 1 mrad."""
-    folder = shortened_demo(tmp_path_factory.mktemp("noisy") / "demo", 1_300)
+    folder = shortened_demo(tmp_path_factory.mktemp("noisy") / "demo", 800)
     log = read_log(folder / "sway_train.npz")
     noise = 1e-3 * np.random.default_rng(0).normal(size=log.joint_position.shape)
     write_log(replace(log, joint_position=log.joint_position + noise), folder / "noisy.npz")
     return folder
 
 
-def identified(demo: Path, out: Path, *overrides: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Metrics and parameters of a run on the noisy log."""
+def identified(demo: Path, out: Path, *overrides: str) -> dict[str, Any]:
+    """Metrics of a run on the noisy log."""
     more = (f"logs.train=[{demo / 'noisy.npz'}]", *overrides)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
         assert main(["identify", "--verbose", str(demo / "quadruped.yaml"), f"output={out}", *more]) == 0
-    return json.loads((out / "metrics.json").read_text()), json.loads((out / "parameters.json").read_text())
+    return dict(json.loads((out / "metrics.json").read_text()))
 
 
 def test_a_run_says_how_much_was_noise_and_gives_more_to_what_is_small(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found, _ = identified(demo, tmp_path / "found")
+    found = identified(demo, tmp_path / "found")
     said = " ".join(capsys.readouterr().out.split())
     assert f"motion noise up to {100.0 * found['motion_noise']['largest']:.2g} % of the information" in said
     assert 0.01 < found["motion_noise"]["largest"] < 1.0
     assert found["motion_noise"]["combinations"] == found["rank"]
     none = [f"sensors.noise.{name}=0" for name in ("joint_position", "base_orientation")]
-    without, _ = identified(demo, tmp_path / "without", *none)
+    without = identified(demo, tmp_path / "without", *none)
     assert without["motion_noise"]["largest"] < 0.1 * found["motion_noise"]["largest"], "the base's position is left"
-    stated, _ = identified(demo, tmp_path / "stated", "sensors.noise.joint_position=0.001")
-    assert stated["motion_noise"]["largest"] == pytest.approx(found["motion_noise"]["largest"], rel=0.2)
 
 
-@pytest.mark.parametrize("settings", ["{cutoff_hz: 8}", "{cutoff_hz: 8, sample_rate_hz: 50}", "{cutoff_hz: null}"])
+@pytest.mark.parametrize("settings", ["{cutoff_hz: 8, sample_rate_hz: 50}", "{cutoff_hz: null}"])
 def test_blocks_have_the_noise_of_the_whole_log(demo: Path, tmp_path: Path, settings: str) -> None:
     def noise(*more: str) -> MotionNoise:
         with warnings.catch_warnings():

@@ -58,23 +58,16 @@ def _run_kept_inside(run: Path) -> None:
 
 FOREIGN: dict[str, tuple[Add, str]] = {
     "notes": (_text("notes.txt"), "notes.txt, which torchid did not write"),
-    "notes in the evaluations": (_text("evaluation/notes.txt"), "evaluation/notes.txt, which"),
     "notes in an evaluation": (_text("evaluation/log/notes.txt"), "evaluation/log/notes.txt, which"),
-    "a thesis beside the hyperparameters": (_text("hparams/thesis.tex"), "hparams/thesis.tex, which"),
-    "a recorded log": (_text("logs/recorded.npz"), "logs/, which"),
-    "an event file": (_text("events.out.tfevents.1.host.2.0"), "events.out.tfevents.1.host.2.0, which"),
-    "a checkpoint": (_text("checkpoint.pt"), "checkpoint.pt, which"),
     "a hidden file": (_text(".git/config"), ".git/, which"),
     "a hidden folder of a name like ours": (_text(".x-01234567.torchid/notes.txt"), ".x-01234567.torchid/, which"),
     "an empty folder": (lambda run: (run / "ideas").mkdir(), "ideas/, which"),
     "a pipe": (lambda run: os.mkfifo(run / "pipe"), "pipe, which"),
     "control characters": (_text("\x1b[2J\n.txt"), r"\x1b[2J\n.txt, which"),
     "edited figures": (_text("metrics.json"), "metrics.json, changed since torchid wrote it"),
-    "an edited evaluation": (_text("evaluation/log/metrics.json"), "evaluation/log/metrics.json, changed"),
     "a link in place of a file": (_link("metrics.json"), "metrics.json, which"),
     "a link in place of a folder": (_link("hparams"), "hparams, which"),
     "a link in place of the evaluations": (_link("evaluation"), "evaluation, which"),
-    "a link in place of an evaluation": (_link("evaluation/log"), "evaluation/log, which"),
     "a link in place of the manifest": (_link(MANIFEST), "no manifest.json that says"),
     "an evaluation that was copied": (_evaluation_copied, "evaluation/kept/, which"),
     "another run": (_run_kept_inside, "kept/, which"),
@@ -117,11 +110,9 @@ def test_a_folder_as_torchid_left_it_is_replaced_whole_even_if_files_are_gone(tm
 
 
 OTHERS: dict[str, dict[str, str]] = {
-    "somebody's settings": {"config.yaml": "mine"},
     "a run of an older version": {"config.yaml": "x", "parameters.json": "x", "hparams/events.out.tfevents.1": "x"},
     "the manifest of a web page": {"manifest.json": '{"name": "app", "icons": []}'},
     "a manifest cut short": {"manifest.json": '{"torchid": "a run", "files": {'},
-    "a manifest that is a list": {"manifest.json": "[]"},
     "a manifest nested beyond all bounds": {"manifest.json": "[" * 10**5},
 }
 

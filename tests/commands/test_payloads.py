@@ -13,6 +13,7 @@ import yaml
 from currents import HIP_SCALE, HIPS, KNEE_SCALE, KNEES, NOISE, quadruped_files
 from refusals import refusal
 from repository import DEMO
+from run_folders import document, identified
 
 from torchid.cli import main
 from torchid.commands.check import check_experiment
@@ -37,23 +38,15 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
     return quadruped_files(folder, SCALES, loads={"b": BAG}, sensors=SENSORS, logs=RECORDED, estimator=EXACT)
 
 
-def document(run: Path, name: str) -> dict[str, Any]:
-    return dict(json.loads((run / f"{name}.json").read_text()))
-
-
-def identified(file: Path, run: Path, *more: str) -> tuple[dict[str, Any], list[float]]:
+def fitted(file: Path, run: Path, *more: str) -> tuple[dict[str, Any], list[float]]:
     """What a run says, and the scales that it finds."""
     assert main(["identify", str(file), f"output={run}", *more]) == 0
     return document(run, "metrics"), [1.0 + x["value"] for x in document(run, "parameters")["extras"]]
 
 
-def phi(run: Path) -> np.ndarray:
-    return np.array([list(body["identified"].values()) for body in document(run, "parameters")["bodies"]])
-
-
 def test_a_known_load_in_one_log_gives_scales_and_masses(world: tuple[Path, float], tmp_path: Path) -> None:
     file, mass = world
-    metrics, scales = identified(file, tmp_path / "run")
+    metrics, scales = fitted(file, tmp_path / "run")
     assert scales == pytest.approx([HIP_SCALE, KNEE_SCALE], abs=1e-8)
     assert metrics["total_mass"] == pytest.approx(mass, abs=1e-7)
     assert metrics["confounded"] == []
@@ -62,11 +55,12 @@ def test_a_known_load_in_one_log_gives_scales_and_masses(world: tuple[Path, floa
     assert metrics["test"]["joint_torque_rms"] < 1e-9 < 1e-2 < metrics["test_nominal"]["joint_torque_rms"]
 
 
+@pytest.mark.slow("three fits of the same logs")
 def test_all_ways_to_read_agree(world: tuple[Path, float], tmp_path: Path) -> None:
     """Block by block, from files of factors, and in an evaluation."""
     file, _ = world
     for name, more in (("whole", ()), ("disk", ("preprocessing.memory_gb=1e-5",))):
-        identified(file, tmp_path / name, *more)
+        fitted(file, tmp_path / name, *more)
     factors = tmp_path / "factors"
     assert main(["compress", str(file), "--output", str(factors)]) == 0
     assert read_factors(factors / "a.factor").payloads == []
@@ -75,9 +69,9 @@ def test_all_ways_to_read_agree(world: tuple[Path, float], tmp_path: Path) -> No
     settings["logs"] = {"train": [str(factors / "*.factor")], "test": RECORDED["test"]}
     fleet = file.with_name("fleet.yaml")
     fleet.write_text(yaml.safe_dump(settings))
-    identified(fleet, tmp_path / "fleet")
+    fitted(fleet, tmp_path / "fleet")
     for name in ("disk", "fleet"):
-        np.testing.assert_allclose(phi(tmp_path / name), phi(tmp_path / "whole"), atol=1e-8)
+        np.testing.assert_allclose(identified(tmp_path / name), identified(tmp_path / "whole"), atol=1e-8)
     assert main(["evaluate", str(tmp_path / "whole"), "--log", str(file.parent / "new.npz")]) == 0
     found = json.loads((tmp_path / "whole/evaluation/new/metrics.json").read_text())["new"]
     assert found["identified"]["joint_torque_rms"] < 1e-9
@@ -113,6 +107,7 @@ def test_a_payload_that_cannot_be_is_refused_in_one_line(
     assert found.startswith(f"torchid: {bad}: ")
 
 
+@pytest.mark.slow("three checks of the demo")
 def test_check_takes_the_robot_with_its_load(tmp_path: Path) -> None:
     """The demo's log of a robot whose URDF lacks 6 kg of the trunk: with these as a payload nothing is new."""
     urdf = (DEMO / "quadruped.urdf").read_text()

@@ -9,23 +9,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from demo import DEMO
+from demo import DEMO, WITHOUT_TERMS
 from large import SMALL
 from motions import value
 from payloads import load_on
+from run_folders import identified
 from shared_work import run_all
 from synthetic import Oracle
 from walking import MACHINES, recorded, robot_of, truth
 
-from torchid.config.experiment import ActuatorsConfig
 from torchid.logs import Log, write_log
 from torchid.robot import Payload
 
 MACHINE = MACHINES["quadruped"]
 BAG = Payload("trunk", 5.0, (0.05, 0.02, 0.1), (0.02, 0.003, -0.002, 0.03, 0.001, 0.025))
-TERMS = f"actuators={ActuatorsConfig.without_terms()}".replace("None", "null")  # parts choose others than the whole
 ONE = (
-    TERMS,
+    WITHOUT_TERMS,
     "logs.test=[]",
 )
 RUNS = {
@@ -33,10 +32,7 @@ RUNS = {
     "with a load": ("loaded.yaml", ONE),
     "with one that is not stated": ("not_stated.yaml", ONE),
     "in blocks": ("loaded.yaml", (*ONE, SMALL)),
-    "detected": ("loaded.yaml", (*ONE, SMALL, "preprocessing.detect_contacts=true")),
 }
-
-SHARED = ("in blocks", "detected")
 
 
 def carrying(log: Log, seconds: float) -> Log:
@@ -56,7 +52,7 @@ def carrying(log: Log, seconds: float) -> Log:
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     """Folders of the runs by the number of processes."""
-    folder, seconds = tmp_path_factory.mktemp("payloads"), 3.0
+    folder, seconds = tmp_path_factory.mktemp("payloads"), 2.0
     log = recorded(MACHINE, truth(MACHINE, 0, seconds=seconds), seed=0, noise=0.0)
     log = replace(log, contact_wrench_local=None, base_quat_xyzw=None, base_position_world=None)
     write_log(log, folder / "walk.npz")
@@ -74,24 +70,18 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
         (folder / f"{name}.yaml").write_text(json.dumps(settings))
     runs = [(name, folder / file, more) for name, (file, more) in RUNS.items()]
     run_all(1, folder / "1", runs)
-    run_all(2, folder / "2", [run for run in runs if run[0] in SHARED])
+    run_all(2, folder / "2", runs[-1:])
     return {processes: folder / str(processes) for processes in (1, 2)}
-
-
-def document(run: Path, name: str) -> dict[str, Any]:
-    return dict(json.loads((run / f"{name}.json").read_text()))
-
-
-def phi(run: Path) -> np.ndarray:
-    return np.array([list(body["identified"].values()) for body in document(run, "parameters")["bodies"]])
 
 
 def test_what_is_identified_is_the_robot_without_its_load(folders: dict[int, Path]) -> None:
     """To a filter's error of the load's forces, which are filtered by themselves."""
-    truthful, stated, not_stated = (phi(folders[1] / name) for name in list(RUNS)[:3])
+    truthful, stated, not_stated = (identified(folders[1] / name) for name in list(RUNS)[:3])
     assert np.abs(stated - truthful).max() < 0.02 * np.abs(not_stated - truthful).max()
 
 
 def test_blocks_find_what_the_whole_log_gives(folders: dict[int, Path]) -> None:
     for folder in folders.values():
-        np.testing.assert_allclose(phi(folder / "in blocks"), phi(folders[1] / "with a load"), rtol=0.0, atol=1e-8)
+        np.testing.assert_allclose(
+            identified(folder / "in blocks"), identified(folders[1] / "with a load"), rtol=0.0, atol=1e-8
+        )

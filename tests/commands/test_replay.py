@@ -26,14 +26,12 @@ UNSEEN = str(DEMO / "sway_test.npz")
 pytestmark = pytest.mark.filterwarnings("ignore:identified.urdf")
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the demo."""
-    folder = tmp_path_factory.mktemp("run") / "run"
-    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={folder}", "estimator.ridge=0.001"]) == 0
-    return folder
+@pytest.fixture
+def run(demo_run: Path) -> Path:
+    return demo_run
 
 
+@pytest.mark.slow("windows of a motion in MuJoCo with all samples of the parameters")
 def test_the_identified_robot_stays_nearer_to_a_new_log_than_the_urdf(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ from shared_work import TORCHRUN, finish, finish_forked, lines_of_torchid
 from torchid.cli import main
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("processes", [2, 4])
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_processes_compress_a_log_each_to_the_files_of_one(tmp_path: Path, processes: int) -> None:
@@ -44,7 +44,7 @@ def compressed_by(processes: int, file: Path, output: Path) -> tuple[int, str, s
 
 
 def test_a_log_that_one_process_cannot_compress_ends_all_in_one_line(tmp_path: Path) -> None:
-    file = walks(tmp_path / "walks", "biped", (2.0, 1.5), sensors={"set": "full"})
+    file = walks(tmp_path / "walks", "biped", (1.0, 0.8), sensors={"set": "full"})
     (tmp_path / "walks" / "right.npz").write_bytes(b"no log")
     status, printed, complained = compressed_by(2, file, tmp_path / "factors")
     assert status != 0
@@ -55,7 +55,7 @@ def test_a_log_that_one_process_cannot_compress_ends_all_in_one_line(tmp_path: P
 
 
 def test_warnings_of_other_processes_are_told_by_the_first(tmp_path: Path) -> None:
-    file = walks(tmp_path / "walks", "biped", (2.0, 1.5), sensors={"set": "joints", "on_base_lost": "warn"})
+    file = walks(tmp_path / "walks", "biped", (1.0, 0.8), sensors={"set": "joints", "on_base_lost": "warn"})
     with np.load(tmp_path / "walks" / "right.npz") as log:
         fields = {key: log[key] for key in log}
     fields["contact_wrench_local"] = fields["contact_wrench_local"].copy()

@@ -35,7 +35,7 @@ def samples(run: Path) -> int:
 def test_they_are_dropped_and_a_line_counts_them_by_contact(
     dragged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name, limit in (("all", "null"), ("auto", "auto"), ("stated", "0.05")):
+    for name, limit in (("all", "null"), ("auto", "auto")):
         assert main(["identify", str(dragged), f"preprocessing.max_slip={limit}", f"output={tmp_path / name}"]) == 0
         said = [line for line in capsys.readouterr().err.splitlines() if "samples dropped" in line]
         if name == "all":
@@ -61,9 +61,7 @@ def test_feet_that_stand_lose_no_sample(dragged: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (("preprocessing.max_slip=fast",), "preprocessing.max_slip: found 'fast'; accepted: auto, null, or a number"),
         (("preprocessing.max_slip=0",), "preprocessing.max_slip: found 0; accepted: auto, null, or a number"),
-        (("preprocessing.max_slip=1e-9",), "in which no contact slips; accepted: a larger preprocessing.max_slip"),
         (
             ("preprocessing.max_slip=1e-9", "preprocessing.memory_gb=0.0001"),
             "in which no contact slips; accepted: a larger preprocessing.max_slip",

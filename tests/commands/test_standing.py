@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from demo import DEMO
+from demo import DEMO, NO_TERMS
 from experiments import changed, load
 from legged.robots import GO2
 from motions import value
 from refusals import refused
 from repository import SHARED
+from run_folders import document
 from walking import MACHINES, recorded, truth
 
 from torchid.cli import main
@@ -35,7 +36,7 @@ NO_BASE: dict[str, Any] = {"base_quat_xyzw": None, "base_position_world": None}
 @pytest.fixture(scope="module")
 def logs() -> tuple[Log, Log]:
     """A walk and another of a quadruped, recorded with the pose of its base."""
-    one, other = (recorded(MACHINE, truth(MACHINE, 0, seconds=3.0), seed=seed, noise=0.1) for seed in (0, 1))
+    one, other = (recorded(MACHINE, truth(MACHINE, 0, seconds=2.0), seed=seed, noise=0.1) for seed in (0, 1))
     return replace(one, contact_wrench_local=None), replace(other, contact_wrench_local=None)
 
 
@@ -55,6 +56,7 @@ def written(tmp_path: Path, logs: tuple[Log, Log]) -> Written:
             "logs": {"train": ["train.npz"], "test": ["test.npz"]},
             "preprocessing": {"cutoff_hz": 15} | preprocessing,
             "sensors": "joints",
+            "actuators": NO_TERMS,
             "estimator": {"name": "least_squares", "ridge": 1e-3},
             "output": str(tmp_path / "run"),
         }
@@ -64,21 +66,17 @@ def written(tmp_path: Path, logs: tuple[Log, Log]) -> Written:
     return write
 
 
-def metrics_of(run: Path) -> dict[str, Any]:
-    return dict(json.loads((run / "metrics.json").read_text()))
-
-
 def test_a_fit_without_the_pose_of_the_base_predicts_as_well_as_with_it(written: Written, tmp_path: Path) -> None:
     file = written(lambda log: log)
     assert main(["identify", str(file), f"output={tmp_path / 'measured'}"]) == 0
     file = written(base_motion="contacts")
     assert main(["identify", str(file)]) == 0
-    measured, derived = (metrics_of(tmp_path / name)["test"]["nullspace_rms"] for name in ("measured", "run"))
-    nominal = metrics_of(tmp_path / "run")["test_nominal"]["nullspace_rms"]
+    measured, derived = (document(tmp_path / name, "metrics")["test"]["nullspace_rms"] for name in ("measured", "run"))
+    nominal = document(tmp_path / "run", "metrics")["test_nominal"]["nullspace_rms"]
     assert derived < 1.1 * measured
     assert derived < 0.3 * nominal
     assert main(["evaluate", str(tmp_path / "run"), "--log", str(tmp_path / "test.npz")]) == 0
-    again = metrics_of(tmp_path / "run" / "evaluation" / "test")["test"]["identified"]["nullspace_rms"]
+    again = document(tmp_path / "run" / "evaluation" / "test", "metrics")["test"]["identified"]["nullspace_rms"]
     assert again == pytest.approx(derived, rel=1e-12)
 
 
@@ -101,7 +99,7 @@ def test_a_fit_with_detected_contacts_predicts_far_better_than_the_urdf(written:
     """A foot here carries a twentieth of the weight for a while, which friction of 15 % of each torque hides."""
     file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts=True)
     assert main(["identify", str(file)]) == 0
-    metrics = metrics_of(tmp_path / "run")
+    metrics = document(tmp_path / "run", "metrics")
     assert metrics["test"]["nullspace_rms"] < 0.4 * metrics["test_nominal"]["nullspace_rms"]
 
 
@@ -168,10 +166,11 @@ def standing_go2(folder: Path, **preprocessing: Any) -> dict[str, Any]:
     }
     (folder / "stand.yaml").write_text(json.dumps(settings))
     assert main(["identify", str(folder / "stand.yaml")]) == 0
-    return metrics_of(folder / "run")
+    return document(folder / "run", "metrics")
 
 
 @REAL
+@pytest.mark.slow("a recording of 80 s, fitted with bodies that exist")
 def test_a_standing_go2_without_an_imu_is_predicted_better_than_by_its_urdf(tmp_path: Path) -> None:
     metrics = standing_go2(tmp_path)
     assert metrics["test"]["nullspace_rms_relative"] < 0.40

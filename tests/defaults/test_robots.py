@@ -88,7 +88,7 @@ def test_a_structure_rings_at_its_frequency_with_the_stated_acceleration() -> No
     np.testing.assert_allclose(torque, drawn.mode[3] * (2.0 * np.pi * drawn.mode[0]) ** 2 * place, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_defaults_are_judged(tmp_path: Path) -> None:
     make("panda", 0, tmp_path)
     status, out, err = call("default_accuracy", "judge", str(tmp_path), "--json", str(tmp_path / "out.json"))

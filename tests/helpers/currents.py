@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from demo import NO_TERMS
 from motions import value
 from payloads import load_on
 from repository import DEMO
@@ -63,6 +64,7 @@ def quadruped_files(
         "contacts": [{"frame": foot, "type": "point", "radius": 0.0} for foot in FEET],
         "logs": {"train": ["a.npz", "b.npz"], "test": ["new.npz"]},
         "sensors": {"set": "joints", "noise": NOISE},
+        "actuators": NO_TERMS,
         "output": str(folder / "run"),
     } | settings  # fmt: skip
     (folder / "quadruped.yaml").write_text(yaml.safe_dump(experiment))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from demo import shortened_demo
+from demo import NO_TERMS, shortened_demo
 from motions import value
 from walking import MACHINES, recorded, truth
 
@@ -42,6 +42,7 @@ def walks(folder: Path, machine: str, seconds: Sequence[float] = SECONDS, **sett
         "logs": {"train": list(WALKS[: len(seconds)])},
         "preprocessing": {"cutoff_hz": 10.0},
         "sensors": {"set": "full"},
+        "actuators": NO_TERMS,
         "estimator": {"name": "least_squares", "ridge": 1e-3},
         "output": str(folder / "run"),
     }
@@ -67,7 +68,7 @@ def fitted_twice(file: Path, *overrides: str) -> tuple[Identification, Identific
 
 def demo_fleet(folder: Path) -> Path:
     """The folder, with the demo cut short: logs.yaml, and experiment.yaml with the factors of both of its logs."""
-    shortened_demo(folder, 400)
+    shortened_demo(folder, 200)
     settings = yaml.safe_load((folder / "quadruped.yaml").read_text())
     settings["sensors"]["noise"] |= {"base_force": 0.3, "base_moment": 0.1}
     settings |= {"output": str(folder / "run"), "estimator": {"ridge": 0.1}}

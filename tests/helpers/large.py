@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from demo import DEMO
+from demo import DEMO, WITHOUT_TERMS_LINE
 from motions import RATE, angles, position
 from scipy.spatial.transform import Rotation
 
@@ -56,7 +56,7 @@ def experiment(folder: Path, fields: Fields, suffix: str = ".npz") -> Path:
     logs = "logs: {train: [sway_train.npz], test: [sway_test.npz]}"
     assert logs in text
     text = text.replace("joint_torque: 0.1, contact_force: 0.5", "joint_torque: 10.0, contact_force: 20.0")  # as it is
-    (folder / "run.yaml").write_text(text.replace(logs, f"logs: {{train: [log{suffix}]}}"))
+    (folder / "run.yaml").write_text(text.replace(logs, f"logs: {{train: [log{suffix}]}}") + WITHOUT_TERMS_LINE)
     return folder / "run.yaml"
 
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from torchid.commands.folder import (
     EVALUATION,
@@ -43,3 +48,14 @@ def everything(folder: Path) -> dict[str, tuple[bytes, str]]:
 def names_in(folder: Path) -> list[str]:
     """What is in a folder."""
     return sorted(path.name for path in folder.iterdir())
+
+
+def document(run: Path, name: str) -> dict[str, Any]:
+    """One of the JSON files of a run: parameters, metrics, report."""
+    return dict(json.loads((run / f"{name}.json").read_text()))
+
+
+def identified(run: Path) -> NDArray[np.float64]:
+    """Parameters (L, 12) that a run has found."""
+    bodies = document(run, "parameters")["bodies"]
+    return np.array([[*body["identified"].values()] for body in bodies])

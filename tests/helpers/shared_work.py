@@ -33,6 +33,7 @@ def write_experiments(folder: Path) -> dict[str, Path]:
     The arm's log has folds of more than one chunk of `SMALL_CHUNK` samples, so that processes share them; the biped's
     are short.
     """
+    from demo import NO_TERMS
     from synthetic import PANDA, Oracle, load, make_log
 
     from torchid.logs import write_log
@@ -41,14 +42,14 @@ def write_experiments(folder: Path) -> dict[str, Path]:
     feet = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right")]
     walks = [[True] * 4, [True, False, False, True], [False, True, True, False]]
     robots: dict[str, Any] = {
-        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [250], "joints"),
-        "arm": (PANDA, True, [], [[]], [350], "joints"),
+        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [150], "joints"),
+        "arm": (PANDA, True, [], [[]], [200], "joints"),
         "biped": (
             ROOT / "configs" / "biped.urdf",
             False,
             [("l_sole", 6), ("r_sole", 6)],
             [[True, True], [True, False], [False, True]],
-            [150, 120],
+            [80, 70],
             {"set": "full", "offsets": {"contact_force": "log", "contact_moment": "log"}},
         ),
     }
@@ -74,6 +75,7 @@ def write_experiments(folder: Path) -> dict[str, Path]:
             "contacts": [{"frame": frame, "type": "point" if size == 3 else "flat"} for frame, size in contacts],
             "logs": {"train": files},
             "sensors": (sensors if isinstance(sensors, dict) else {"set": sensors}) | RANDOM,
+            "actuators": NO_TERMS,
             "estimator": {"name": "least_squares", "ridge": 1e-3},
             "output": str(folder / name / "run"),
         }

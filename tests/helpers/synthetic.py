@@ -33,7 +33,6 @@ def robots_folder() -> Path:
 
 ROBOTS = robots_folder()
 SOLO12 = ROBOTS / "solo_description/robots/solo12.urdf"
-SOLO8 = ROBOTS / "solo_description/robots/solo.urdf"
 G1 = ROBOTS / "g1_description/urdf/g1_29dof_rev_1_0.urdf"
 ANYMAL = ROBOTS / "anymal_c_simple_description/urdf/anymal.urdf"
 TALOS = ROBOTS / "talos_data/robots/talos_reduced.urdf"

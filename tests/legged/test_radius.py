@@ -19,7 +19,8 @@ from torchid.fitting.experiment import set_up
 from torchid.fitting.factor_files import row_model, with_choices_of
 from torchid.logs import write_log
 
-SECONDS = 12.0
+SECONDS = 8.0
+RADIUS_M = 0.025
 
 
 def experiment(folder: Path) -> Path:
@@ -36,32 +37,29 @@ output: run
     return folder / "experiment.yaml"
 
 
-@pytest.mark.parametrize("radius", [0.0, 0.025])
-def test_the_radius_of_feet_is_found_where_they_are_balls(tmp_path: Path, radius: float) -> None:
+@pytest.mark.slow("8 s of a walk in MuJoCo")
+def test_the_radius_of_feet_is_found_where_they_are_balls(tmp_path: Path) -> None:
     """Feet of the demo's robot, whose URDF has no shape for them; the recorded ones are balls or points."""
-    true = TrueRobot.unlike_its_urdf(replace(QUADRUPED, radius=radius))
+    true = TrueRobot.unlike_its_urdf(replace(QUADRUPED, radius=RADIUS_M))
     exact = simulated(true, Reference(true, SECONDS, seed=0), SECONDS)
     write_log(record(exact, true.robot.base_link, Noise(), np.random.default_rng(0)), tmp_path / "log.npz")
     setup, choices = with_chosen_settings(set_up(load_config(experiment(tmp_path))), Progress(disable=True))
     assert choices.radius is not None
-    if radius:
-        assert choices.radius.radius == pytest.approx(radius, abs=2e-3)
-        assert {contact.radius for contact in setup.contacts} == {choices.radius.radius}
-        assert {contact.radius for contact in setup.config.contacts} == {choices.radius.radius}
-        assert f"ball of radius {1e3 * choices.radius.radius:.3g} mm, by the logs" in setup.rolling
-    else:
-        assert choices.radius.radius is None
-        assert {contact.radius for contact in setup.contacts} == {0.0}
+    assert choices.radius.radius == pytest.approx(RADIUS_M, abs=2e-3)
+    assert {contact.radius for contact in setup.contacts} == {choices.radius.radius}
+    assert {contact.radius for contact in setup.config.contacts} == {choices.radius.radius}
+    assert f"ball of radius {1e3 * choices.radius.radius:.3g} mm, by the logs" in setup.rolling
     model = row_model(setup, setup.builder(setup.sensors))  # what a file of factors keeps of it
     again = with_choices_of(model, set_up(load_config(experiment(tmp_path))))
     assert again.contacts == setup.contacts
     assert row_model(again, again.builder(again.sensors)).settings == model.settings
 
 
+@pytest.mark.slow("2 s of a walk in MuJoCo")
 def test_a_log_that_does_not_say_where_the_ground_is_keeps_points(tmp_path: Path) -> None:
     """Balls need the base's orientation, which an IMU alone does not give."""
     true = TrueRobot.unlike_its_urdf(QUADRUPED)
-    exact = simulated(true, Reference(true, 4.0, seed=0), 4.0)
+    exact = simulated(true, Reference(true, 2.0, seed=0), 2.0)
     log = record(exact, true.robot.base_link, Noise(), np.random.default_rng(0))
     write_log(replace(log, base_quat_xyzw=None, contact_wrench_world=None), tmp_path / "log.npz")
     setup, choices = with_chosen_settings(set_up(load_config(experiment(tmp_path))), Progress(disable=True))

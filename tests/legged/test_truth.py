@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from legged.errors import parameter_errors, structural_base
-from legged.gait import Reference, balanced_path
+from legged.gait import Reference
 from legged.recording import Noise, record
 from legged.robots import FRICTION_WIDTH, G1, GO2, QUADRUPED, Legged, TrueRobot
 from legged.simulate import Exact, prescribed, simulated
@@ -105,18 +105,6 @@ def test_forces_along_a_prescribed_motion_are_pinocchios(legged: Legged) -> None
     assert np.abs(needed - given).max() < 1e-9 * np.abs(given).max()
 
 
-@pytest.mark.parametrize("legged", WALKERS)
-def test_rates_are_those_of_the_positions(legged: Legged) -> None:
-    for exact, tolerance in ((planned(legged), 2e-3), (walked(legged), 0.02)):
-        log = exact.log
-        still = slice(10, 140)  # before the first swing: no impacts
-        rate = np.gradient(log.joint_position, log.time, axis=0)[still]
-        assert np.abs(rate - exact.rate[still, 6:]).max() < tolerance
-        quat = Rotation.from_quat(value(log.base_quat_xyzw))
-        turned = (quat[:-2].inv() * quat[2:]).as_rotvec() / (log.time[2:] - log.time[:-2])[:, None]
-        assert np.abs(turned - exact.rate[1:-1, 3:6])[still].max() < tolerance
-
-
 # ---------------------------------------------------------------------------------------------------------- the ground
 
 
@@ -150,26 +138,7 @@ def test_feet_are_lifted_push_and_do_not_slip(legged: Legged) -> None:
     assert np.mean(tangent < 1.4) > 0.95, "inside the friction cone: no slip"
 
 
-def test_a_balanced_path_has_its_zero_moment_point_where_it_was_asked_for() -> None:
-    support = np.cumsum(np.random.default_rng(0).normal(size=(200, 2)), axis=0) * 1e-2
-    path = balanced_path(support, 0.5)
-    acceleration = np.diff(path, 2, axis=0) * 50.0**2
-    np.testing.assert_allclose((path[1:-1] - 0.5 / 9.81 * acceleration), support[1:-1], atol=1e-12)
-
-
 # ---------------------------------------------------------------------------------------------- the truth, and sensors
-
-
-@pytest.mark.parametrize("legged", WALKERS)
-def test_true_robots_are_possible_and_unlike_their_urdfs(legged: Legged) -> None:
-    true = true_robot(legged)
-    nominal = true.robot.nominal
-    off = true.phi[:, 0] / nominal[:, 0] - 1.0
-    assert 0.05 < np.abs(off).max() <= 0.2
-    assert (true.friction > 0.0).all()
-    assert (true.armature > 0.0).all()
-    same = TrueRobot.unlike_its_urdf(legged, share=0.0)
-    np.testing.assert_allclose(same.phi[:, :10], nominal[:, :10], atol=1e-12)
 
 
 @pytest.mark.parametrize("legged", WALKERS)
@@ -201,7 +170,7 @@ def test_a_recording_has_the_noise_that_is_stated_and_no_rates() -> None:
     np.testing.assert_allclose(bound.base.specific_force, rates.base.specific_force[2:-2], atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_no_robot_falls() -> None:
     for legged in (GO2, G1, QUADRUPED):
         for seed in range(3):

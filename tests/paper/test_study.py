@@ -99,7 +99,7 @@ def test_figures_and_charts_are_written(study: tuple[Path, str]) -> None:
     assert len(joints.Scalars("all runs/base_force")) == len(CONDITIONS)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_two_processes_write_the_study_of_one(tmp_path: Path) -> None:
     script, outputs = str(ROOT / "scripts" / "reproduce_paper.py"), []
     for name, before in (("one", (sys.executable,)), ("two", (*TORCHRUN, "2"))):
@@ -112,7 +112,7 @@ def test_two_processes_write_the_study_of_one(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "two"]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_folder_that_holds_something_else_ends_both_processes_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     script = str(ROOT / "scripts" / "reproduce_paper.py")

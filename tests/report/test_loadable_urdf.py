@@ -140,8 +140,8 @@ def test_collisions_that_mujoco_does_not_find_or_read_are_left_out_and_said(name
 @pytest.mark.parametrize(
     ("urdf", "file", "feet"),
     [
-        pytest.param(BIPED, CONFIGS / "biped_full.yaml", SOLES, id="biped", marks=pytest.mark.slow),
-        pytest.param(TALOS_FULL, None, ("left_sole_link", "right_sole_link"), id="Talos", marks=pytest.mark.slow),
+        pytest.param(BIPED, CONFIGS / "biped_full.yaml", SOLES, id="biped", marks=pytest.mark.study),
+        pytest.param(TALOS_FULL, None, ("left_sole_link", "right_sole_link"), id="Talos", marks=pytest.mark.study),
         pytest.param(SOLO12, None, ("FL_FOOT", "HR_FOOT"), id="Solo12"),
     ],
 )

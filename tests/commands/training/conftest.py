@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from demo import NO_TERMS
 from repository import DEMO
 from tensorboard.summary.writer import event_file_writer
 from trainings import (
@@ -47,6 +48,7 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
             fields = {key: x if key.endswith("names") else x[part] for key, x in file.items()}
         np.savez(folder / f"{name}.npz", **fields)
     settings = yaml.safe_load((DEMO / "quadruped.yaml").read_text())
+    settings["actuators"] = NO_TERMS
     settings["logs"] = {"train": ["train.npz"], "validation": ["held_out.npz"], "test": ["test.npz"]}
     training: dict[str, Any] = {"epochs": EPOCHS, "batch_size": 64, "evaluate_every": EVERY, "checkpoint_seconds": 0}
     training |= {"optimizer": {"name": "Adam", "lr": 0.05}, "schedule": {"name": "CosineAnnealingLR"}}

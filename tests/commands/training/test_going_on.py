@@ -16,7 +16,7 @@ from hostile_commands import Commands
 from repository import DEMO
 from run_figures import OF_A_RUN
 from run_folders import names_in
-from thinned import slow_but
+from thinned import study_but
 from trainings import (
     BY_EPOCH,
     EPOCHS,
@@ -174,7 +174,7 @@ def test_a_run_killed_at_any_moments_ends_as_if_it_had_not_been(
     assert_as_uninterrupted(output, run)
 
 
-@pytest.mark.parametrize("number", slow_but([signal.SIGTERM], [signal.SIGINT, signal.SIGTERM]))
+@pytest.mark.parametrize("number", study_but([signal.SIGTERM], [signal.SIGINT, signal.SIGTERM]))
 def test_a_signal_ends_a_training_with_a_line_on_how_to_go_on(
     experiment: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], number: int
 ) -> None:

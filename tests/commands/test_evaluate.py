@@ -1,16 +1,20 @@
-"""Errors of a run against the noise that its sensors leave: in the table, metrics.json and the figure of forces."""
+"""Evaluations, wherever they are written, and the noise that sensors leave beside the errors of a run."""
 
 from __future__ import annotations
 
 import json
+from contextlib import redirect_stdout
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from demo import shortened_demo
+from refusals import files_in
 
 from torchid.cli import main
+from torchid.commands.folder import EVALUATION, read_manifest
 from torchid.parameters import Array
 from torchid.report.forces import ForceSeries, force_figure
 
@@ -22,31 +26,55 @@ def floors(run: Path) -> dict[str, dict[str, float]]:
     return found
 
 
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A folder with the shortened demo and its run, and what that printed."""
+    folder = shortened_demo(tmp_path_factory.mktemp("evaluated") / "demo", 400)
+    with redirect_stdout(StringIO()) as printed:
+        assert main(["identify", "--verbose", str(folder / "quadruped.yaml"), f"output={folder / 'run'}"]) == 0
+    return folder, printed.getvalue()
+
+
 @UNPHYSICAL
-def test_a_run_gives_the_noise_beside_its_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    demo, run = shortened_demo(tmp_path / "demo", 400), tmp_path / "run"
-    assert main(["identify", "--verbose", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
-    found, printed = floors(run), capsys.readouterr().out
+def test_an_evaluation_elsewhere_is_the_same_and_leaves_the_run_as_it_was(
+    demo: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = demo[0] / "run"
+    before = files_in(run)
+    evaluating = ["evaluate", str(run), "--log", str(demo[0] / "sway_test.npz")]
+    assert main([*evaluating, "--output", str(tmp_path / "evaluated")]) == 0
+    assert f"written to    {tmp_path / 'evaluated'}" in capsys.readouterr().out
+    assert files_in(run) == before
+    kind = read_manifest(tmp_path / "evaluated")
+    assert kind is not None
+    assert kind.kind == EVALUATION.name
+    assert main(evaluating) == 0
+    usual = run / "evaluation" / "sway_test"
+    assert {file.name for file in usual.iterdir()} == {file.name for file in (tmp_path / "evaluated").iterdir()}
+    evaluated = json.loads((usual / "metrics.json").read_text())
+    assert json.loads((tmp_path / "evaluated" / "metrics.json").read_text()) == evaluated
+    assert evaluated["sway_test"]["noise_floor"] == pytest.approx(floors(run)["test"], rel=1e-9)
+
+
+def test_a_run_gives_the_noise_beside_its_errors(demo: tuple[Path, str]) -> None:
+    folder, printed = demo
+    found = floors(folder / "run")
     assert 0.06 < found["test"]["joint_torque"] < 0.08  # 0.1 N m and 0.5 N at 0.3 m, of which the filter leaves 0.38
     assert found["train"]["projected_residual"] == pytest.approx(0.38, abs=0.01)
     for value in (found["train"]["base_force"], found["test"]["base_moment"]):
         assert f"{value:.4g}" in printed
     assert printed.count("│   noise alone") == 4
-    assert main(["evaluate", str(run), "--log", str(demo / "sway_test.npz")]) == 0
-    evaluated = json.loads((run / "evaluation/sway_test/metrics.json").read_text())["sway_test"]
-    assert evaluated["noise_floor"] == pytest.approx(found["test"], rel=1e-9)
 
 
 @UNPHYSICAL
 def test_noise_that_residuals_show_is_no_measure_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    demo, run = shortened_demo(tmp_path / "demo", 400), tmp_path / "run"
+    demo, run = shortened_demo(tmp_path / "demo", 150), tmp_path / "run"
     text = (demo / "quadruped.yaml").read_text()
     stated = "noise: {joint_torque: 0.1, contact_force: 0.5, contact_moment: 0.05}"
     assert stated in text
     (demo / "quadruped.yaml").write_text(text.replace(stated, "noise: {}"))
     assert main(["identify", "--verbose", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
     assert floors(run) == {"train": {}, "test": {}}
-    assert main(["evaluate", str(run), "--log", str(demo / "sway_test.npz")]) == 0
     assert "│   noise alone" not in capsys.readouterr().out
 
 
