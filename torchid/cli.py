@@ -82,14 +82,14 @@ def _command(options: argparse.Namespace) -> int | None:
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The parsed command line; overrides may also follow options, which argparse does not support."""
     parser = _parser()
-    options, rest = parser.parse_known_args(arguments)
-    keys = [text.lstrip("-").partition("=")[0].replace("-", "_") for text in rest if text.startswith("-")]
+    options, overrides = parser.parse_known_args(arguments)
+    keys = [text.lstrip("-").partition("=")[0].replace("-", "_") for text in overrides if text.startswith("-")]
     has_settings = hasattr(options, "overrides")
-    if keys or (rest and not has_settings):
+    if keys or (overrides and not has_settings):
         accepted = f"; accepted: settings of the file as {keys[0]}=VALUE" if has_settings else ""
-        parser.error(f"unrecognized arguments: {' '.join(rest)}{accepted}")
-    if rest:
-        options.overrides = [*options.overrides, *rest]
+        parser.error(f"unrecognized arguments: {' '.join(overrides)}{accepted}")
+    if overrides:
+        options.overrides = [*options.overrides, *overrides]
     return options
 
 
@@ -262,11 +262,13 @@ def _add_amount(command: argparse.ArgumentParser) -> None:
 
 def _show(options: argparse.Namespace, lines: Callable[[int], Iterable[Any]], details: Callable[[int], Any]) -> None:
     """Print what a command says for the terminal's width: nothing, the answer, or with `--verbose` all details."""
-    from torchid.report.tables import terminal_width
-    from torchid.terminal.lines import show
+    from rich.table import Table
 
-    if not options.quiet:
-        show((details if options.verbose else lines)(terminal_width()))
+    from torchid.report.tables import print_tables, terminal_width
+
+    parts = () if options.quiet else (details if options.verbose else lines)(terminal_width())
+    for part in parts:
+        print_tables(part) if isinstance(part, Table) else print(part)
 
 
 def _identify(options: argparse.Namespace) -> None:
@@ -322,8 +324,10 @@ def _replay(options: argparse.Namespace) -> None:
         from torchid.terminal.simulations import replay_lines
 
     gains = parse_gains("--kp", options.kp), parse_gains("--kd", options.kd)
-    found = replay(options.run, options.log, options.window, options.output, options.overwrite, *gains, options.samples)
-    _show(options, partial(replay_lines, found), partial(replay_lines, found, verbose=True))
+    replayed = replay(
+        options.run, options.log, options.window, options.output, options.overwrite, *gains, options.samples
+    )
+    _show(options, partial(replay_lines, replayed), partial(replay_lines, replayed, verbose=True))
 
 
 def _sample(options: argparse.Namespace) -> None:
@@ -380,11 +384,10 @@ def _check(options: argparse.Namespace) -> int:
 def _init(options: argparse.Namespace) -> None:
     with importing():
         from torchid.commands.init import init
-        from torchid.report.tables import terminal_width
-        from torchid.terminal.lines import labelled, show
+        from torchid.report.tables import labelled, terminal_width
 
     for label, text in init(options.urdf, options.log, options.output, options.total_mass).lines:
-        show(labelled(label, text, terminal_width()))
+        print("\n".join(labelled(label, text, terminal_width())))
 
 
 def _convert(options: argparse.Namespace) -> None:

@@ -18,9 +18,8 @@ from torchid.config import load_analysis
 from torchid.identifiability.base_parameters import unobservable_parameters
 from torchid.problem.metrics import ROW_GROUPS
 from torchid.report.analysis import SetAccuracy
-from torchid.report.tables import terminal_width
+from torchid.report.tables import LINES, terminal_width
 from torchid.terminal.analysis import analysis_lines
-from torchid.terminal.lines import LINES
 
 SIDES = ("front_left", "front_right", "rear_left", "rear_right")
 LEGS = tuple(f"{side}-limb-of-a-robot-with-names-that-are-rather-long" for side in SIDES)

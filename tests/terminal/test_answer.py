@@ -22,9 +22,9 @@ from torchid.fitting.noise import unexplained_torques
 from torchid.parameters import COULOMB, FRICTION, INERTIAL, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import DECISIVE_GROUPS, LIMB_GROUPS, WHITENED, WorseThanNominal
+from torchid.report.tables import LINES
 from torchid.sensing import named_sensors
 from torchid.terminal.identification import answer_lines
-from torchid.terminal.lines import LINES
 
 UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
 WIDTHS = (60, 80, 100, 120)

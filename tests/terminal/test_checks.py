@@ -15,8 +15,8 @@ from repository import DEMO
 from torchid.cli import main
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, Finding, Skipped, Span
 from torchid.logs import Log, write_log
+from torchid.report.tables import LINES
 from torchid.terminal.analysis import check_lines
-from torchid.terminal.lines import LINES
 
 SPIKE = Finding(
     "spike", REJECTED, "joint_torque", "excursions of 200 N m in front_right_hip, which no motion explains",

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchid.report.tables import WIDTH, terminal_width
-from torchid.terminal.lines import CUT, column_lines, labelled, wrap_words
+from torchid.report.tables import CUT, WIDTH, column_lines, labelled, terminal_width, wrap_words
 
 LONG = "front-left-limb-of-a-robot-whose-names-are-longer-than-a-line"
 

@@ -9,8 +9,8 @@ import pytest
 from simulated import shipped
 
 from torchid.config import SimulationConfig
+from torchid.report.tables import LINES
 from torchid.simulation import Stability
-from torchid.terminal.lines import LINES
 from torchid.terminal.simulations import simulation_lines
 
 STANDS = Stability((0.622, 0.835), 0.001, 0.0002, 0.076, 0.0, 0.01, (0.0, 0.33))

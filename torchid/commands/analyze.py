@@ -86,7 +86,7 @@ class ScenarioAnalysis:
         return _plan_label(self.name)
 
     def _headline(self) -> str:
-        plan, names = self.plan, join_names([one.name for one in self.plan.chosen])
+        plan, names = self.plan, join_names([sensor.name for sensor in self.plan.chosen])
         what = f"{len(plan.chosen)} sensors at a cost of {plan.cost:g} ({plan.proof}): {names}"
         return f"{self.name}, {len(self.states)} contact states, {what}"
 
@@ -111,7 +111,10 @@ class Analysis:
 
     def _headline(self) -> str:
         sets = f"; accuracy of {join_names(list(self.accuracies))}" if self.accuracies else ""
-        chosen = [f"{one.name}: {len(one.plan.chosen)} sensors, cost {one.plan.cost:g}" for one in self.scenarios]
+        chosen = [
+            f"{scenario.name}: {len(scenario.plan.chosen)} sensors, cost {scenario.plan.cost:g}"
+            for scenario in self.scenarios
+        ]
         return f"{self.setup.robot.path.name}; {'; '.join(chosen)}{sets}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -123,8 +126,8 @@ class Analysis:
                 "proposed": None if proposed is None else observability_document(proposed),
                 "base_parameters": base_parameters_document(scenario.base, names),
             }
-        accuracy = {name: one.as_dict() for name, one in self.accuracies.items()} or None
-        without = {name: asdict(one) for name, one in self.without.items()} or None
+        accuracy = {name: accuracy.as_dict() for name, accuracy in self.accuracies.items()} or None
+        without = {name: asdict(evidence) for name, evidence in self.without.items()} or None
         document = {"scenarios": scenarios, "accuracy": accuracy, "resting_share": self.resting}
         return document | {"sensors_left_out": without}
 
@@ -262,17 +265,17 @@ def _leave_out(request: AnalysisRequest, train: Sequence[Samples]) -> dict[str, 
     if sensors is None or not train:
         return {}
     robot, contacts = setup.robot, setup.contacts
-    own = contained_candidates(contacts, sensors, candidates(robot, contacts, ft_sensors=robot.ft_names))
-    dropped = {one.name: [one] for one in own}
-    kinds = {one.kind: [other for other in own if other.kind == one.kind] for one in own}
-    dropped |= {f"{ALL_OF}{kind}": some for kind, some in kinds.items() if 1 < len(some) < len(own)}
+    available = contained_candidates(contacts, sensors, candidates(robot, contacts, ft_sensors=robot.ft_names))
+    dropped = {candidate.name: [candidate] for candidate in available}
+    kinds = {candidate.kind: [other for other in available if other.kind == candidate.kind] for candidate in available}
+    dropped |= {f"{ALL_OF}{kind}": members for kind, members in kinds.items() if 1 < len(members) < len(available)}
     sets = {}
-    for name, some in dropped.items():
+    for name, members in dropped.items():
         torque, wrench = sensors.torque.copy(), sensors.wrench.copy()
-        for one in some:
-            torque[list(one.dofs)] = False
-            if one.contact is not None:
-                wrench[one.contact] = False
+        for member in members:
+            torque[list(member.dofs)] = False
+            if member.contact is not None:
+                wrench[member.contact] = False
         if (torque & ~robot.is_passive).any() or wrench.any():
             sets[name] = replace(sensors, torque=torque, wrench=wrench)
     return leave_sensors_out(train, setup.fitter(setup.builder(sensors), setup.conditions()), setup.terms, sets)
@@ -415,7 +418,7 @@ def _chosen_along_normals(choice: SensorPlan, contacts: Sequence[Contact]) -> tu
 def _is_chosen(choice: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact]) -> bool:
     """Whether a set, read along the axes of these contacts, is the chosen one; what none can exert does not count."""
     chosen = sensor_set(choice.problem.robot, contacts, choice.chosen)
-    wrench, other = (measured_components(contacts, one) for one in (chosen, sensors))
+    wrench, other = (measured_components(contacts, read) for read in (chosen, sensors))
     same = np.array_equal(chosen.torque, sensors.torque) and np.array_equal(wrench, other)
     return same and not _chosen_along_normals(choice, contacts)
 
@@ -428,7 +431,7 @@ def _write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -
         which = "planned" if scenario.proposed is None else "proposed"
         texts.append(base_parameters_text(f"{scenario.name}, {which} sensors", scenario.base, names))
         figures[f"sensors-{scenario.name}"] = _picture(setup, scenario)
-    if any(found.measured is not None for found in analysis.accuracies.values()):
+    if any(accuracy.measured is not None for accuracy in analysis.accuracies.values()):
         figures["accuracy"] = accuracy_figure(analysis.accuracies)
     with during("writing", output), new_folder(output, overwrite, ANALYSIS) as folder:
         (folder / "config.yaml").write_text(dump_config(setup.config))

@@ -168,32 +168,34 @@ def summary_lines(run: Results) -> list[str]:
     ]
     said += [("attention", "; ".join(filter(None, trouble)))] if any(trouble) else []
     said.append(("written to", str(config.output or "no folder: write(folder), to_urdf(file)")))
-    of = f"{robot.path.name}, {len(run)} bodies, {format_count(robot.n, 'joint')}, by {config.estimator.name}"
+    title = f"{robot.path.name}, {len(run)} bodies, {format_count(robot.n, 'joint')}, by {config.estimator.name}"
     lines = (f"{label:12}{shorten(text, _WIDTH, placeholder=' ...')}" for label, text in said)
-    return [f"Identification of {of}", *lines]
+    return [f"Identification of {title}", *lines]
 
 
 def _total_mass(run: Results) -> str:
-    gain, of = run.experiment.config.sensors.gain_error, run.experiment.robot.format
+    gain, file_kind = run.experiment.config.sensors.gain_error, run.experiment.robot.format
     counted = run.mass.determined and run.estimate.gain_error is not None and run.estimate.gain_error.any()
     gains = f"; ± counts gain errors of {100.0 * gain:g} %" if counted else ""
-    return f"{run.mass} ({of}: {decimal(run.mass.nominal)} kg{gains})"
+    return f"{run.mass} ({file_kind}: {decimal(run.mass.nominal)} kg{gains})"
 
 
 def _judge(run: Results) -> ErrorComparison:
-    of = run.experiment.robot.format
+    file_kind = run.experiment.robot.format
     if "test" in run.metrics:
         files = run.experiment.config.logs
         names = [log_title(path) for path in files.test]
         motion = "motion that the fit has seen" if tests_on_seen_samples(files) else "unseen motion"
         at_rest = "test" in run.at_rest
         text = f"{'the test logs' if at_rest else motion} ({join_names(names, 2)})"
-        return ErrorComparison(text, run.metrics["test"].nominal, run.metrics["test"].identified, of, at_rest)
+        return ErrorComparison(text, run.metrics["test"].nominal, run.metrics["test"].identified, file_kind, at_rest)
     if run.validation is not None:
         text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
-        return ErrorComparison(text, run.validation.nominal, run.validation.identified, of, "train" in run.at_rest)
+        return ErrorComparison(
+            text, run.validation.nominal, run.validation.identified, file_kind, "train" in run.at_rest
+        )
     nominal, identified = run.metrics["train"]
-    return ErrorComparison("the training logs themselves", nominal, identified, of, "train" in run.at_rest)
+    return ErrorComparison("the training logs themselves", nominal, identified, file_kind, "train" in run.at_rest)
 
 
 def _headline(run: Results, judged: ErrorComparison) -> str:
@@ -205,11 +207,11 @@ def _headline(run: Results, judged: ErrorComparison) -> str:
 
 def _bodies_text(run: Results) -> str:
     names, robot = [], run.experiment.robot
-    for one in run.violations:
-        if one.body is not None and robot.body_names[one.body] not in names:
-            names.append(robot.body_names[one.body])
+    for violation in run.violations:
+        if violation.body is not None and robot.body_names[violation.body] not in names:
+            names.append(robot.body_names[violation.body])
     count = len(robot.body_names)
-    if all(one.term is not None for one in run.violations):
+    if all(violation.term is not None for violation in run.violations):
         ends = massless_ends(robot, run.phi)
         if ends:
             return f"all that have mass can exist; MuJoCo refuses joints that move none: {join_names(ends)}"
@@ -223,8 +225,8 @@ def _bodies_text(run: Results) -> str:
 
 def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
     """What the user should look at: conditions with what they mean and what to do, the most urgent first."""
-    mass, of, estimate = run.mass, run.experiment.robot.format, run.estimate
-    terms = [one.term for one in run.violations if one.term is not None]
+    mass, file_kind, estimate = run.mass, run.experiment.robot.format, run.estimate
+    terms = [violation.term for violation in run.violations if violation.term is not None]
     least = estimate.relative_increase if isinstance(estimate, ConsistentEstimate) else None
     growth = np.sqrt(1.0 + (least or 0.0))
     ratio = mass.value / mass.nominal if mass.nominal else np.nan
@@ -232,7 +234,7 @@ def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
     is_off = abs(mass.value - mass.nominal) > MAX_MASS_ERROR * mass.nominal
     contradicts = run.experiment.config.estimator.total_mass is None and mass.determined and is_clear and is_off
     is_open = not mass.determined and (is_off or not run.experiment.robot.fixed_base)
-    let = f", and the fit lets it be {decimal(mass.value)} kg ({decimal(mass.nominal)} kg by the {of})" * is_off
+    let = f", and the fit lets it be {decimal(mass.value)} kg ({decimal(mass.nominal)} kg by the {file_kind})" * is_off
     independent = f"{run.samples / estimate.oversampling:.0f} independent samples"
     rules = (
         (bool(run.worse), ADVICE),
@@ -252,8 +254,8 @@ def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
          "friction, compliance or contacts are missing, or a sensor is wrong (torchid check): "
          f"{run.misfit.in_short}"),
         *((True, text) for text in _resting(run)),
-        (contradicts, f"the total mass is {ratio:.3g} times the {of}'s: weigh the robot, or mend units and gains of "
-                      "forces: torchid check"),
+        (contradicts, f"the total mass is {ratio:.3g} times the {file_kind}'s: weigh the robot, or mend units and "
+                      "gains of forces: torchid check"),
         (not run.misfit.judged,
          "whether the model explains these forces is not known: no noise is stated, and the logs are too short to tell "
          "it from errors of the model; state sensors.noise, or record more"),
@@ -261,7 +263,7 @@ def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
          f"95 % intervals count noise alone, no error of the model, which {independent} do not show: record more"),
         (is_open, f"these data do not determine the total mass{let}; weigh the robot: estimator.total_mass"),
         *((True, text) for text in _implicit(run)),
-        *((True, one.in_short) for one in _confounded(run)),
+        *((True, confounded.in_short) for confounded in _confounded(run)),
         *((True, text) for text in _far_off(run.posterior)),
         (bool(run.noise.suggested), f"noise: {noise_advice(run.noise.suggested)}"),
     )  # fmt: skip
@@ -346,8 +348,8 @@ def _implicit(run: Results) -> Iterator[str]:
         return
     kd = values_by_name("logs.columns.joint_torque.pd.kd", torque.pd.kd.value, robot.joint_names)
     known = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
-    found = {x.extra.name: x.value - known[x.extra.name] for x in run.extras if x.extra.what == "armature"}
-    if step := implicit_step(kd, found, float(np.median(np.diff(run.forces.time)))):
+    added = {x.extra.name: x.value - known[x.extra.name] for x in run.extras if x.extra.what == "armature"}
+    if step := implicit_step(kd, added, float(np.median(np.diff(run.forces.time)))):
         yield f"armatures are {1e3 * step:.2g} ms times the stated kd: no rotors, but a simulator's implicit PD law"
 
 
@@ -371,8 +373,8 @@ def _unlike_joints(run: Results) -> Iterator[str]:
     """That the fit leaves much of the torque of single joints of a bolted robot."""
     fitted = run.metrics["train"].identified
     if run.experiment.robot.fixed_base and (joints := unexplained_joints(fitted)):
-        left = fitted.by_joint_relative
-        named = join_names([f"{format_percent(left[name] or 0.0)} % of the torque of {name}" for name in joints])
+        shares = fitted.by_joint_relative
+        named = join_names([f"{format_percent(shares[name] or 0.0)} % of the torque of {name}" for name in joints])
         yield f"the fit leaves {named}; check sign, unit and gear there, and its encoder: torchid check"
 
 

@@ -127,7 +127,9 @@ def _warning_in_first_process() -> Iterator[None]:
     """Let the first process warn of what any of them warns of within the block."""
     with nullcontext() if distributed.is_first() else warnings.catch_warnings(record=True) as caught:
         yield
-    for of_process in distributed.all_gather([(str(one.message), one.category) for one in caught or ()], "warnings"):
+    for of_process in distributed.all_gather(
+        [(str(warning.message), warning.category) for warning in caught or ()], "warnings"
+    ):
         for message, category in of_process if distributed.is_first() else ():
             warnings.warn(message, category, stacklevel=2)
 
@@ -166,9 +168,9 @@ def _compressed(
     """The logs one by one: only one at a time is in memory twice."""
     builder = experiment.builder(experiment.sensors)
     model = row_model(experiment, builder)
-    origins = {one.group: one.origin for one in noise.groups if one.origin != "stated"}
+    origins = {group.group: group.origin for group in noise.groups if group.origin != "stated"}
     streaming = bars.add_task("streaming samples", total=sum(map(len, logs)))
-    for path, log, own, left_out in zip(paths, logs, states, excluded, strict=True):
+    for path, log, log_states, left_out in zip(paths, logs, states, excluded, strict=True):
         yield FactorFile(
             compress_log(log, builder, lambda n: bars.advance(streaming, n)),
             model,
@@ -176,8 +178,8 @@ def _compressed(
             _checksum(path),
             float(log.time[-1] - log.time[0]),
             left_out,
-            own,
-            payloads=[asdict(one) for one in experiment.config.logs.payloads_of(path)],
+            log_states,
+            payloads=[asdict(payload) for payload in experiment.config.logs.payloads_of(path)],
             noise_origins=origins,
         )
 
@@ -196,19 +198,19 @@ def _write_all(
     names: Sequence[str], factors: Iterable[tuple[str, FactorFile]], output: Path, overwrite: bool
 ) -> list[CompressedFile]:
     """Write the files of all processes, by name, in the first of them: a file of each at a time."""
-    rounds: Iterable[list[tuple[str, FactorFile] | None]] = ([one] for one in factors)
+    rounds: Iterable[list[tuple[str, FactorFile] | None]] = ([factor_file] for factor_file in factors)
     if distributed.world_size() > 1:
         with distributed.apart():
-            own = list(factors)
-        most = max(distributed.all_gather(len(own), "numbers of files"))
-        rounds = (distributed.all_gather(own[k] if k < len(own) else None, "files") for k in range(most))
+            written = list(factors)
+        most = max(distributed.all_gather(len(written), "numbers of files"))
+        rounds = (distributed.all_gather(written[k] if k < len(written) else None, "files") for k in range(most))
     files = {}
     writing = new_folder(output, overwrite, COMPRESSED) if distributed.is_first() else nullcontext()
     with during("writing", output), writing as folder:
         for of_processes in rounds:
-            for name, one in filter(None, of_processes):
+            for name, factor_file in filter(None, of_processes):
                 if folder is not None:
-                    files[name] = _write(folder / name, one)
+                    files[name] = _write(folder / name, factor_file)
     return distributed.broadcast([files[name] for name in names if name in files], "files")
 
 

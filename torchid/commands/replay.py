@@ -89,7 +89,7 @@ class Replay:
 
         Of joints it is the root mean square over them. A robot that has fallen over is far off, but no farther matters.
         """
-        nominal, identified = (self._quartiles_of(one) for one in self.drift)
+        nominal, identified = (self._quartiles_of(drift) for drift in self.drift)
         return {name: Comparison(nominal[name], identified[name]) for name in nominal}
 
     def _quartiles_of(self, drift: Drift) -> dict[str, Array]:
@@ -102,8 +102,8 @@ class Replay:
 
     def ranges(self) -> dict[str, Array]:
         """Least and largest median drift of the robots that were drawn, (2, T), by what drifts; empty without any."""
-        medians = [{name: x[1] for name, x in self._quartiles_of(one).items()} for one in self.sampled]
-        each = {name: np.stack([one[name] for one in medians]) for name in (medians[0] if medians else ())}
+        medians = [{name: x[1] for name, x in self._quartiles_of(drift).items()} for drift in self.sampled]
+        each = {name: np.stack([median[name] for median in medians]) for name in (medians[0] if medians else ())}
         return {name: np.stack([x.min(axis=0), x.max(axis=0)]) for name, x in each.items()}
 
     def at(self, time: float) -> dict[str, Comparison[float]]:
@@ -121,7 +121,7 @@ class Replay:
 
     def by_joint(self) -> dict[str, Comparison[float]]:
         """Median drift at the end of the windows, by joint."""
-        each = [_quartiles(np.abs(one.joints[:, -1]))[1].tolist() for one in self.drift]
+        each = [_quartiles(np.abs(drift.joints[:, -1]))[1].tolist() for drift in self.drift]
         return {name: Comparison(*pair) for name, *pair in zip(self.joint_names, *each, strict=True)}
 
     def to_dict(self) -> dict[str, object]:
@@ -187,7 +187,7 @@ def replay(
         reading = bars.add_task("reading the log", total=1)
         (bound,) = LogReader(fitted.experiment, folder).read([Path(log)], None, lambda _: bars.advance(reading))
         windows, drift, sampled = _drifts(fitted, folder, bound, window, gains, samples, bars)
-    found = Replay(
+    replayed = Replay(
         source=split_range(log).name,
         window=float(window),
         windows=windows,
@@ -200,8 +200,8 @@ def replay(
         output=out,
     )
     if out is not None:
-        _write(found, out, overwrite, fitted.experiment.config.figures.format)
-    return found
+        _write(replayed, out, overwrite, fitted.experiment.config.figures.format)
+    return replayed
 
 
 def _require_accepted(window: float, samples: int) -> None:
@@ -220,9 +220,13 @@ def _drifts(
     windows = logs.nominal.windows(window)
     bar = bars.add_task("replaying", total=(2 + count) * len(windows))
     feet = _feet(fitted.experiment.contacts, robot.path) if not robot.fixed_base else ()
-    rest = feet, windows, window * np.arange(1, _TIMES + 1) / _TIMES, lambda n: bars.advance(bar, n), gains
-    drift = Comparison(*(replay_log(model, of, *rest) for model, of in zip(models, logs, strict=True)))
-    return len(windows), drift, tuple(replay_log(model, logs.identified, *rest) for model in _drawn(fitted, run, count))
+    conditions = feet, windows, window * np.arange(1, _TIMES + 1) / _TIMES, lambda n: bars.advance(bar, n), gains
+    drift = Comparison(*(replay_log(model, log, *conditions) for model, log in zip(models, logs, strict=True)))
+    return (
+        len(windows),
+        drift,
+        tuple(replay_log(model, logs.identified, *conditions) for model in _drawn(fitted, run, count)),
+    )
 
 
 def _replayed_pairs(
@@ -230,12 +234,12 @@ def _replayed_pairs(
 ) -> tuple[Comparison[ReplayedLog], Comparison[Model]]:
     """What drives the robot of its file and the identified one, and both."""
     robot, calibration = fitted.experiment.robot, fitted.calibrations.identified
-    logs = Comparison(*(_replayed(one) for one in (samples, *calibration.calibrate([samples]))))
+    logs = Comparison(*(_replayed(log) for log in (samples, *calibration.calibrate([samples]))))
     joints: dict[str, dict[str, float]] = {what: {} for what in ACTUATORS}
     for extra, value in calibration.of_joints:
         joints[extra.what][extra.name] = value
-    own = joints, calibration.phi.reshape(robot.nominal.shape), calibration.builder.tree.stribeck
-    identified = _model(folder / identified_name(robot), robot, *own)
+    fitted_joints = joints, calibration.phi.reshape(robot.nominal.shape), calibration.builder.tree.stribeck
+    identified = _model(folder / identified_name(robot), robot, *fitted_joints)
     return logs, Comparison(_model(robot.path, robot, {}, None), identified)
 
 
@@ -251,7 +255,9 @@ def _drawn(fitted: FittedRun, run: Path, count: int) -> Iterator[Model]:
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # said of the identified robot, when it was written
         for number, phi in enumerate(samples.phi.numpy()):
-            joints = {what: {name: float(x[number]) for name, x in of.items()} for what, of in of_joints.items()}
+            joints = {
+                what: {name: float(x[number]) for name, x in values.items()} for what, values in of_joints.items()
+            }
             file = Path(folder) / identified_name(robot)
             in_file = FittedJoints(joints["armature"], joints["stiffness"], joints["torque_offset"])
             file.write_bytes(identified_robot(robot, phi, in_file))
@@ -288,19 +294,19 @@ def _joint_gains(robot: Robot, option: str, stated: float | Mapping[str, float])
     return out
 
 
-def _write(found: Replay, out: Path, overwrite: bool, form: str) -> None:
+def _write(replayed: Replay, out: Path, overwrite: bool, form: str) -> None:
     """Write all numbers and the figure of a replay, in a format, to a folder."""
     figure = drift_figure(
-        found.driven,
-        found.drift.nominal.time,
-        found.quartiles(),
-        found.ranges(),
-        found.by_joint(),
-        found.units,
-        found.of,
+        replayed.driven,
+        replayed.drift.nominal.time,
+        replayed.quartiles(),
+        replayed.ranges(),
+        replayed.by_joint(),
+        replayed.units,
+        replayed.of,
     )
     with during("writing", out), new_folder(out, overwrite, REPLAY) as folder:
-        write_json(folder / "replay.json", found.to_dict())
+        write_json(folder / "replay.json", replayed.to_dict())
         save_figures({"drift": figure}, folder, form)
 
 

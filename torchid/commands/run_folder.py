@@ -178,11 +178,11 @@ def _metrics_document(run: Identification) -> dict[str, object]:
         "total_mass": run.mass.value if run.mass.determined else None,
         "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
         "total_mass_separable_from_offsets": run.mass.separable,
-        "confounded": [asdict(one) | {"message": str(one)} for one in list_confounded(run.extras)],
+        "confounded": [asdict(confounded) | {"message": str(confounded)} for confounded in list_confounded(run.extras)],
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
         "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
         "noise": {
-            "groups": [asdict(one) for one in run.noise.groups],
+            "groups": [asdict(group) for group in run.noise.groups],
             "used": NoiseGroups.of(robot).settings(run.noise.known),
             "suggested": run.noise.suggested,
         },
@@ -198,7 +198,7 @@ def _metrics_document(run: Identification) -> dict[str, object]:
         },
         "ridge_selection": None if run.ridge is None else asdict(run.ridge),
         **{f"{name}_selection": x and asdict(x) for name, x in vars(run.choices).items()},
-        "worse_than_nominal": [asdict(one) for one in run.worse],
+        "worse_than_nominal": [asdict(group) for group in run.worse],
         "verdict": describe_worse(run.worse, robot.format),
         "contact_states": run.state_entries(),
         "identifiability": _identifiability_document(run),
@@ -341,21 +341,22 @@ def write_events(run: Results, folder: Path, figures: Mapping[str, bytes]) -> No
 
 def _errors(run: Results, nominal: bool) -> dict[str, Metrics]:
     """Errors by set of logs, of blocks that are left out of the fit, too."""
-    found = {name: pair.nominal if nominal else pair.identified for name, pair in run.metrics.items()}
+    errors = {name: pair.nominal if nominal else pair.identified for name, pair in run.metrics.items()}
     if run.validation is not None:
-        found["left_out"] = run.validation.nominal if nominal else run.validation.identified
-    return found
+        errors["left_out"] = run.validation.nominal if nominal else run.validation.identified
+    return errors
 
 
 def _answer_lines(run: Results) -> list[str]:
     """What the terminal says first."""
-    said, of = answer(run), run.experiment.robot.format
+    said, file_kind = answer(run), run.experiment.robot.format
     errors = [
-        f"{group}: {before:.4g} by the {of}, {after:.4g} identified{'' if floor is None else f', {floor:.4g} noise'}"
+        f"{group}: {before:.4g} by the {file_kind}, {after:.4g} identified"
+        + ("" if floor is None else f", {floor:.4g} noise")
         for group, before, after, floor in said.errors
     ]
     named = [f"total mass: {said.total_mass}", f"bodies: {said.bodies}"]
-    return [said.headline, "", *errors, "", *named, *(f"attention: {one}" for one in said.attention)]
+    return [said.headline, "", *errors, "", *named, *(f"attention: {text}" for text in said.attention)]
 
 
 def _final(run: Results) -> dict[str, float]:

@@ -44,8 +44,10 @@ def simulate(config: SimulationConfig) -> dict[str, Stability]:
         InputError: whatever does not fit, or a robot that does not keep standing; nothing has been written then.
     """
     check_free(config.output, config.overwrite, SIMULATION, [config.robot.path])
-    of = config.robot
-    robot = load_robot(of.path, weld=of.weld, loops=[loop.loop for loop in of.loops], passive=of.passive)
+    settings = config.robot
+    robot = load_robot(
+        settings.path, weld=settings.weld, loops=[loop.loop for loop in settings.loops], passive=settings.passive
+    )
     simulation = set_up_simulation(config)
     for motion in config.motions:
         simulation.reference(motion)

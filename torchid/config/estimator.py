@@ -243,5 +243,5 @@ def _keys_of(estimator: type) -> set[str]:
     return keys | ({"training"} if issubclass(estimator, TrainingSettings) else _OF_BATCH_FITS)
 
 
-def _fields(of: type) -> list[str]:
-    return [field.name for field in dataclasses.fields(of)]
+def _fields(settings: type) -> list[str]:
+    return [field.name for field in dataclasses.fields(settings)]

@@ -119,13 +119,13 @@ def _add_payloads(payloads: dict[str, Any], field: str, entry: object) -> None:
         return
     field, given = f"{field}.payload", entry["payload"]
     several = given if isinstance(given, list) else [given]
-    found = [_payload(field if given is not several else f"{field}.{k}", one) for k, one in enumerate(several)]
+    new = [_payload(field if given is not several else f"{field}.{k}", one) for k, one in enumerate(several)]
     file = _file(field, entry)
-    if not found:
+    if not new:
         raise ConfigError.at_field(field, "an empty list", PAYLOAD_ACCEPTED)
-    if payloads.get(file, found) != found:
+    if payloads.get(file, new) != new:
         raise ConfigError.at_field(field, f"another than that of {file} elsewhere", "one payload in all of a recording")
-    payloads[file] = found
+    payloads[file] = new
 
 
 def _payload(field: str, given: object) -> dict[str, Any]:
@@ -177,7 +177,7 @@ def _file(field: str, entry: Mapping[str, object]) -> str:
         if not isinstance(files, list) or len(files) < 2:
             found = "one file" if isinstance(files, list) and files else f"found {excerpt(repr(files))}"
             raise ConfigError.at_field(f"{field}.files", found, f"{_FILES}; file for a single one")
-        return join_files([_joined(f"{field}.files.{number}", one) for number, one in enumerate(files)])
+        return join_files([_joined(f"{field}.files.{number}", joined) for number, joined in enumerate(files)])
     file = entry.get("file")
     if not isinstance(file, str) or not file:
         found = "missing" if "file" not in entry else f"found {excerpt(repr(file))}"
@@ -251,8 +251,8 @@ def _parts(files: Mapping[str, Sequence[Path]]) -> Parts:
     return {key: [_part(f"logs.{key}", path) for path in files[key]] for key in SETS}
 
 
-def _surely_share(one: LogPart, other: LogPart) -> bool:
-    return one.shares_samples(other) is True
+def _surely_share(part: LogPart, other: LogPart) -> bool:
+    return part.shares_samples(other) is True
 
 
 def _resolved_payloads(logs: LogsConfig) -> dict[str, list[Payload]]:
@@ -302,8 +302,8 @@ def require_apart(parts: Parts, share: Callable[[LogPart, LogPart], bool]) -> No
     if both := sorted(str(part) for _, part in _sharing(parts, "train", "validation", share)):
         raise ConfigError.at_field("logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
     for key in SETS:
-        for one, other in _sharing(parts, key, key, share):
-            raise ConfigError.at_field(f"logs.{key}", f"{one} and {other} share samples", "every sample once")
+        for part, other in _sharing(parts, key, key, share):
+            raise ConfigError.at_field(f"logs.{key}", f"{part} and {other} share samples", "every sample once")
 
 
 def _sharing(
@@ -314,9 +314,9 @@ def _sharing(
     for number, part in enumerate(parts.get(key, ())):
         by_file[part.files[0].path].append((number, part))
     for number, part in enumerate(parts.get(other, ())):
-        for before, one in by_file.get(part.files[0].path, ()):
-            if (key != other or before < number) and share(one, part):
-                yield one, part
+        for before, candidate in by_file.get(part.files[0].path, ()):
+            if (key != other or before < number) and share(candidate, part):
+                yield candidate, part
 
 
 def _part(field: str, path: Path) -> LogPart:
@@ -329,7 +329,7 @@ def _part(field: str, path: Path) -> LogPart:
 def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
     """The paths, with every file that matches in place of a name with * or ? in it."""
     out: list[Path] = []
-    paths = [one for path in paths for one in _each_recording(path)]
+    paths = [recording for path in paths for recording in _each_recording(path)]
     for path in paths:
         part = _part(field, path)
         if part.range is not None and part.file.suffix == FACTORS:

@@ -60,8 +60,8 @@ class LoopConfig:
     @property
     def loop(self) -> Loop:
         """The loop as the robot has it."""
-        one, other = self.frames
-        return Loop((one, other), self.type, self.max_gap, self.max_angle)
+        first, other = self.frames
+        return Loop((first, other), self.type, self.max_gap, self.max_angle)
 
 
 @dataclass(config=STRICT, frozen=True)

@@ -332,11 +332,11 @@ def _absolute_at(value: Any, key: Sequence[str], folder: Path) -> Any:
     """The value with the path at a key made absolute; values of another type are left to the validation."""
     if not key:
         return _absolute_path(value, folder) if isinstance(value, str) else value
-    name, *rest = key
+    name, *below = key
     if name == "*":
-        return [_absolute_at(item, rest, folder) for item in value] if isinstance(value, list) else value
+        return [_absolute_at(item, below, folder) for item in value] if isinstance(value, list) else value
     if isinstance(value, Mapping) and name in value:
-        return {**value, name: _absolute_at(value[name], rest, folder)}
+        return {**value, name: _absolute_at(value[name], below, folder)}
     return value
 
 

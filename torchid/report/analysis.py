@@ -277,10 +277,10 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
 def confounded_messages(sets: Mapping[str, SetAccuracy], in_short: bool = False) -> list[str]:
     """What some sets do not separate, with their names; `in_short`: what to do about it alone."""
     names: dict[str, list[str]] = {}
-    for name, found in sets.items():
-        for message in found.advice if in_short else found.confounded:
+    for name, accuracy in sets.items():
+        for message in accuracy.advice if in_short else accuracy.confounded:
             names.setdefault(message, []).append(name)
-    return [f"{', '.join(of)}: {message}" for message, of in names.items()]
+    return [f"{', '.join(set_names)}: {message}" for message, set_names in names.items()]
 
 
 ALL_OF = "all sensors of kind "
@@ -299,7 +299,9 @@ def left_out_table(without: Mapping[str, Evidence]) -> Table:
 
 def contradicting_messages(without: Mapping[str, Evidence]) -> list[str]:
     """Sensors that make predictions of the others worse, the worst first, then whole kinds of them."""
-    worse = sorted((name.startswith(ALL_OF), -one.gain, name) for name, one in without.items() if one.adopted)
+    worse = sorted(
+        (name.startswith(ALL_OF), -evidence.gain, name) for name, evidence in without.items() if evidence.adopted
+    )
     smaller = [(name, format_percent(-np.expm1(0.5 * loss))) for _, loss, name in worse]
     advice = "check gain, axes and offset: torchid check"
     return [f"without {name} errors of the others are {share} % smaller; {advice}" for name, share in smaller]
@@ -308,7 +310,7 @@ def contradicting_messages(without: Mapping[str, Evidence]) -> list[str]:
 @matplotlib.rc_context(STYLE)
 def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
     """One panel per group of rows that the logs give, with the sensor sets side by side on a logarithmic scale."""
-    measured = {name: found.measured.rms for name, found in sets.items() if found.measured is not None}
+    measured = {name: accuracy.measured.rms for name, accuracy in sets.items() if accuracy.measured is not None}
     groups = [group for group in ROW_GROUPS if any(rms[group] is not None for rms in measured.values())]
     figure = Figure(figsize=(2.6 * max(len(groups), 2) + 0.6, 3.8), layout="constrained")
     axes = figure.subplots(1, len(groups), squeeze=False)[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from textwrap import fill
 from typing import Any
@@ -416,8 +415,7 @@ def tree_figure(
         constrained: joints between the base and a contact.
     """
     constrained = {*constrained, *_loaded_welds(robot, contacts)}
-    positions = _body_positions(robot, contacts)
-    contact_positions = _contact_positions(robot, contacts, positions)
+    positions, contact_positions = _positions(robot, contacts)
     right = max(x for x, _ in positions)
     deepest = max(y for _, y in [*positions, *contact_positions.values()])
     size = max(_COLUMN * (right + 1.0), _LEGEND) + 0.2, _ROW * (deepest + 1) + 1.3
@@ -450,31 +448,26 @@ def _loaded_welds(robot: Robot, contacts: Sequence[Contact]) -> set[str]:
     return welds
 
 
-def _body_positions(robot: Robot, contacts: Sequence[Contact]) -> list[Position]:
-    """Position of every body: leaves side by side, other bodies above their contacts, centred over their children."""
-    contact_count = Counter(robot.link(contact.frame)[0] for contact in contacts)
+def _positions(robot: Robot, contacts: Sequence[Contact]) -> tuple[list[Position], dict[str, Position]]:
+    """Positions of bodies, and of contacts by frame, one below the other under their body.
+
+    Leaves are side by side, other bodies above their contacts, centred over their children.
+    """
+    frames: list[list[str]] = [[] for _ in robot.bodies]
+    for contact in contacts:
+        frames[robot.link(contact.frame)[0]].append(contact.frame)
     children, row = robot.children, [0] * len(robot.bodies)
     for body, link in enumerate(robot.bodies[1:], start=1):
-        row[body] = row[link.parent] + 1 + contact_count[link.parent]
+        row[body] = row[link.parent] + 1 + len(frames[link.parent])
     column, free = [0.0] * len(robot.bodies), 0
     for body in reversed(range(len(robot.bodies))):  # children come after their parents
         if children[body]:
             column[body] = 0.5 * (column[children[body][0]] + column[children[body][-1]])
         else:
             column[body], free = float(free), free + 1
-    return [(max(column) - x, y) for x, y in zip(column, row, strict=True)]
-
-
-def _contact_positions(robot: Robot, contacts: Sequence[Contact], bodies: Sequence[Position]) -> dict[str, Position]:
-    """Positions of contacts, one below the other under their body."""
-    positions: dict[str, Position] = {}
-    count: Counter[int] = Counter()
-    for contact in contacts:
-        body, _ = robot.link(contact.frame)
-        count[body] += 1
-        column, row = bodies[body]
-        positions[contact.frame] = (column, row + count[body])
-    return positions
+    bodies = [(max(column) - x, y) for x, y in zip(column, row, strict=True)]
+    below = {name: (x, y + k) for (x, y), at in zip(bodies, frames, strict=True) for k, name in enumerate(at, start=1)}
+    return bodies, below
 
 
 def _draw_joint(

@@ -50,12 +50,12 @@ def identified_mjcf(
     elements = body_elements(root)
     number = {name: i for i, name in enumerate(model.bodies)}
     explicit = _state_inertias(root, model)
-    rest, beyond = share_with_links_beyond_welds(robot, phi)
+    remaining, beyond = share_with_links_beyond_welds(robot, phi)
     moving = np.array([[body.name != model.bodies[0]] for body in robot.bodies])  # the world has no inertia there
-    warn_if_inconsistent(robot, moving * rest, NAME)
+    warn_if_inconsistent(robot, moving * remaining, NAME)
     written = set[int]()
-    for body, values, own, before in zip(robot.bodies, rest, phi, robot.nominal, strict=True):
-        if np.array_equal(own[parameters.INERTIAL], before[parameters.INERTIAL]) or body.name == model.bodies[0]:
+    for body, values, identified, before in zip(robot.bodies, remaining, phi, robot.nominal, strict=True):
+        if np.array_equal(identified[parameters.INERTIAL], before[parameters.INERTIAL]) or body.name == model.bodies[0]:
             continue
         for name in (link for link in body.links if link in number and link not in robot.links_beyond_welds):
             _set_inertial(elements[number[name]][0], values if name == body.name else np.zeros(parameters.PER_BODY))
@@ -66,7 +66,7 @@ def identified_mjcf(
     for i in range(1, model.model.nbody) if explicit else ():
         if i not in written:
             _set_inertial(elements[i][0], model.inertial(i))
-    _set_joints(robot, model, elements, rest, armature)
+    _set_joints(robot, model, elements, remaining, armature)
     in_degrees = not model.text.multiplies and bool(model.spec.compiler.degree)
     for name, (stiffness, at_rest) in (springs or {}).items():
         joint = model.joints.index(name)
@@ -142,8 +142,8 @@ def _joint_element(
     model: MjcfModel, elements: Sequence[tuple[etree._Element, Sequence[etree._Element]]], number: int
 ) -> etree._Element:
     """The element of a joint, by its number."""
-    of = int(model.model.jnt_bodyid[number])
-    return elements[of][1][number - int(model.model.body_jntadr[of])]
+    body = int(model.model.jnt_bodyid[number])
+    return elements[body][1][number - int(model.model.body_jntadr[body])]
 
 
 def _armature_of_mimics(robot: Robot) -> dict[str, float]:

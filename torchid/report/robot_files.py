@@ -41,10 +41,10 @@ class FittedJoints:
     stribeck_velocity: float | None = None
 
     @classmethod
-    def of(cls, found: Iterable[tuple[Extra, float]], stribeck_velocity: float | None = None) -> FittedJoints:
+    def of(cls, extras: Iterable[tuple[Extra, float]], stribeck_velocity: float | None = None) -> FittedJoints:
         """From extra parameters with their values."""
         values: dict[str, dict[str, float]] = {name: {} for name in IN_FILES}
-        for extra, value in found:
+        for extra, value in extras:
             if extra.what in values:
                 values[extra.what][extra.name] = value
         return cls(**values, stribeck_velocity=stribeck_velocity)

@@ -52,7 +52,7 @@ class RunEvents:
             tags = [f"{_BY_EPOCH}error_relative_{name}" for name in LOG_SETS]
             layout["errors by epoch, share of measured"] = _charts(tags, ROW_GROUPS)
         if by_epoch is not None:
-            losses = [f"loss{of}/data$" for of in ("", "_held_out", "_unseen")]
+            losses = [f"loss{suffix}/data$" for suffix in ("", "_held_out", "_unseen")]
             terms = [f"loss/{term}" for term in _TERMS]
             layout["loss by epoch"] = {"train, held out, unseen": ["Multiline", losses], "terms": ["Multiline", terms]}
         if bodies:
@@ -82,16 +82,14 @@ class RunEvents:
         for name, metrics in sets.items():
             for kind, values in (("relative", metrics.relative), ("rms", metrics.rms)):
                 chart = f"{_BY_EPOCH * by_epoch}error_{kind}_{name}{_NOMINAL * nominal}"
-                for group in ERROR_GROUPS:
-                    if values.get(group) is not None:
-                        self._writer.add_scalar(f"{chart}/{group}", values[group], step)
+                self._add(step, {f"{chart}/{group}": values.get(group) for group in ERROR_GROUPS})
 
     def write_parameters(self, step: int, values: Mapping[str, tuple[float, float]], *, by_epoch: bool = False) -> None:
         """Parameters and their standard errors by name, with the ends of their 95 % intervals."""
-        for name, (value, error) in values.items():
-            ends = (value, value - INTERVAL * error, value + INTERVAL * error)
-            for kind, end in zip(("", *_BOUNDS), ends, strict=True):
-                self._writer.add_scalar(f"{_BY_EPOCH * by_epoch}parameter{kind}/{name}", end, step)
+        tag = f"{_BY_EPOCH * by_epoch}parameter"
+        for kind, sign in zip(("", *_BOUNDS), (0.0, -1.0, 1.0), strict=True):
+            ends = {name: value + sign * INTERVAL * error for name, (value, error) in values.items()}
+            self._add(step, {f"{tag}{kind}/{name}": end for name, end in ends.items()})
 
     def write_answer(self, step: int, lines: Sequence[str]) -> None:
         """What the run says first, line by line."""
@@ -101,9 +99,8 @@ class RunEvents:
         self, step: int, least: Mapping[str, float], *, nominal: bool = False, by_epoch: bool = False
     ) -> None:
         """Smallest eigenvalue of the scaled pseudo-inertia by body; negative: no such body exists."""
-        for body, value in least.items():
-            tag = f"{_BY_EPOCH * by_epoch}smallest_eigenvalue{_NOMINAL * nominal}/{body}"
-            self._writer.add_scalar(tag, value, step)
+        tag = f"{_BY_EPOCH * by_epoch}smallest_eigenvalue{_NOMINAL * nominal}"
+        self._add(step, {f"{tag}/{body}": value for body, value in least.items()})
 
     def write_epoch(self, epoch: Epoch, unseen: float | None = None) -> None:
         """Losses and rates of an epoch of a descent.
@@ -112,19 +109,17 @@ class RunEvents:
             epoch: of the descent.
             unseen: mean squared whitened residual on logs that neither train nor decide, if it was worked out.
         """
-        scalars = {f"loss/{name}": value for name, value in epoch.losses.items()}
-        if epoch.held_out is not None:
-            scalars["loss_held_out/data"] = epoch.held_out
-        if unseen is not None:
-            scalars["loss_unseen/data"] = unseen
-        scalars |= {f"share_of_force/{name}": value for name, value in epoch.shares.items()}
-        if epoch.closed_form:  # 0 for a perfect fit of data without noise
-            scalars["optimum/objective_above_least"] = epoch.objective / epoch.closed_form - 1.0
-        scalars["optimum/distance"] = epoch.distance
-        scalars["training/learning_rate"] = epoch.learning_rate
-        scalars["training/samples_per_second"] = epoch.samples_per_second
-        for tag, value in scalars.items():
-            self._writer.add_scalar(tag, value, epoch.number)
+        least = epoch.closed_form  # 0 for a perfect fit of data without noise
+        scalars = {
+            "loss_held_out/data": epoch.held_out,
+            "loss_unseen/data": unseen,
+            "optimum/objective_above_least": epoch.objective / least - 1.0 if least else None,
+            "optimum/distance": epoch.distance,
+            "training/learning_rate": epoch.learning_rate,
+            "training/samples_per_second": epoch.samples_per_second,
+        }
+        scalars |= {f"loss/{name}": value for name, value in epoch.losses.items()}
+        self._add(epoch.number, scalars | {f"share_of_force/{name}": value for name, value in epoch.shares.items()})
 
     def write_solution(self, estimate: Estimate, samples_per_second: float | None) -> None:
         """Losses of a batch fit, in the charts of a descent.
@@ -134,23 +129,24 @@ class RunEvents:
             samples_per_second: of the stream through the logs, None without one.
         """
         rows = max(estimate.rows, 1)
-        self._writer.add_scalar(f"loss{_NOMINAL}/data", estimate.nominal_cost / rows, 1)
-        self._writer.add_scalar("loss/data", estimate.cost / rows, 1)
-        if samples_per_second is not None:
-            self._writer.add_scalar("training/samples_per_second", samples_per_second, 1)
+        scalars = {
+            f"loss{_NOMINAL}/data": estimate.nominal_cost / rows,
+            "loss/data": estimate.cost / rows,
+            "training/samples_per_second": samples_per_second,
+        }
         if isinstance(estimate, ConstrainedEstimate):
-            self._writer.add_scalar("loss/prior", estimate.objective - estimate.cost / rows, 1)
-            self._writer.add_scalar("optimum/distance", estimate.distance, 1)
-            if estimate.relative_increase is not None:
-                self._writer.add_scalar("optimum/objective_above_least", estimate.relative_increase, 1)
+            scalars |= {
+                "loss/prior": estimate.objective - estimate.cost / rows,
+                "optimum/distance": estimate.distance,
+                "optimum/objective_above_least": estimate.relative_increase,
+            }
+        self._add(1, scalars)
 
     def write_fit(self, step: int, estimate: Estimate) -> None:
         """Statistics of the problem."""
-        scalars = {"residual_std": estimate.residual_std, "rank": estimate.rank}
-        if estimate.rank:
-            scalars["condition_number"] = estimate.condition_number
-        for name, value in scalars.items():
-            self._writer.add_scalar(f"fit/{name}", value, step)
+        condition = estimate.condition_number if estimate.rank else None
+        scalars = {"residual_std": estimate.residual_std, "rank": estimate.rank, "condition_number": condition}
+        self._add(step, {f"fit/{name}": value for name, value in scalars.items()})
 
     def write_identifiability(self, step: int, estimate: Estimate, gain: InformationGain, table: str) -> None:
         """Verdicts, information and singular values; in the chart of the latter, steps are their numbers.
@@ -162,9 +158,7 @@ class RunEvents:
             table: of the verdicts by contact state.
         """
         scalars = {f"verdicts/{verdict}": float(count) for verdict, count in estimate.verdict_counts().items()}
-        scalars |= {"identifiability/bits": gain.bits, "identifiability/combinations": gain.determined}
-        for tag, value in scalars.items():
-            self._writer.add_scalar(tag, value, step)
+        self._add(step, scalars | {"identifiability/bits": gain.bits, "identifiability/combinations": gain.determined})
         self._writer.add_text("verdicts", _preformatted(table), step)
         for index, value in enumerate(estimate.singular_values):
             self._writer.add_scalar("identifiability/singular_value", value, index)
@@ -185,8 +179,13 @@ class RunEvents:
         named = {f"final/{name}": value for name, value in final.items()}
         for summary in hparams(dict(settings), named):  # add_hparams would write a run of its own
             self._writer.file_writer.add_summary(summary)
-        for tag, value in named.items():
-            self._writer.add_scalar(tag, value, step)
+        self._add(step, named)
+
+    def _add(self, step: int, scalars: Mapping[str, float | None]) -> None:
+        """Add a point to the chart of each tag; None: there is none."""
+        for tag, value in scalars.items():
+            if value is not None:
+                self._writer.add_scalar(tag, value, step)
 
 
 def _charts(tags: Sequence[str], groups: Iterable[str]) -> dict[str, list[str | list[str]]]:

@@ -81,30 +81,30 @@ def share_with_links_beyond_welds(robot: Robot, phi: Array) -> tuple[Array, dict
         Parameters of the bodies without links beyond welds, (L, 12), and those of the latter that change, (10,), in
         their own frames.
     """
-    rest, changed = phi.copy(), dict[str, Array]()
+    remaining, changed = phi.copy(), dict[str, Array]()
     for number in sorted({robot.links[name][0] for name in robot.links_beyond_welds}):
         whole = phi[number, parameters.INERTIAL]
         before = {name: x for name, x in robot.links_beyond_welds.items() if robot.links[name][0] == number}
-        own = whole - np.sum(list(before.values()), axis=0)
-        if abs(own[parameters.MASS]) <= _ROUNDING * abs(whole[parameters.MASS]):
-            own = np.zeros_like(own)
+        share = whole - np.sum(list(before.values()), axis=0)
+        if abs(share[parameters.MASS]) <= _ROUNDING * abs(whole[parameters.MASS]):
+            share = np.zeros_like(share)
         empty = [name for name, x in before.items() if not _is_body(x, name in robot.moved_beyond_welds)]
-        if (empty or not _is_body(own, False)) and parameters.consistency_margin(whole) > 0.0:
+        if (empty or not _is_body(share, False)) and parameters.consistency_margin(whole) > 0.0:
             parts = _parts(whole, before, empty)
-            own = whole - np.sum(list(parts.values()), axis=0)
+            share = whole - np.sum(list(parts.values()), axis=0)
             T_link_body = {name: np.asarray(np.linalg.inv(robot.links[name][1]), np.float64) for name in parts}
             changed |= {n: parameters.change_of_frame(T_link_body[n]) @ x for n, x in parts.items() if x.any()}
-        rest[number, parameters.INERTIAL] = own
-    return rest, changed
+        remaining[number, parameters.INERTIAL] = share
+    return remaining, changed
 
 
 def links_that_are_no_bodies(robot: Robot, phi: Array) -> list[str]:
     """Names of links that simulators refuse in a file with parameters (L, 12)."""
-    rest, changed = share_with_links_beyond_welds(robot, phi)
+    remaining, changed = share_with_links_beyond_welds(robot, phi)
     beyond = {name: (x, name in robot.moved_beyond_welds) for name, x in (robot.links_beyond_welds | changed).items()}
     bodies = {
         body.name: (x, bool(x.any()) and body.joint is not None and body.joint.kind != "fixed")
-        for body, x in zip(robot.bodies, rest[:, parameters.INERTIAL], strict=True)
+        for body, x in zip(robot.bodies, remaining[:, parameters.INERTIAL], strict=True)
     }
     return [name for name, (values, moves) in (bodies | beyond).items() if not _is_body(values, moves)]
 

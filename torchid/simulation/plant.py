@@ -162,7 +162,9 @@ class JointConstraints:
     ) -> JointConstraints:
         """Those of a robot's file, with its joints, and of loops and held joints that a run has."""
         held = held or {}
-        mimics = {name: one for name, one in resolve_mimics(path, joints).items() if one.master and name not in held}
+        mimics = {
+            name: mimic for name, mimic in resolve_mimics(path, joints).items() if mimic.master and name not in held
+        }
         return cls(held, mimics, loops)
 
     def add_to(self, spec: mujoco.MjSpec, physics_hz: float) -> None:
@@ -245,11 +247,11 @@ def loop_errors(model: mujoco.MjModel, data: mujoco.MjData, loops: Sequence[Loop
     """How far loops are open: Jacobian (k, nv), error (k,) [m, rad] and bias acceleration (k,) of what closes them."""
     jacobians, errors, biases = [np.zeros((0, model.nv))], [np.zeros(0)], [np.zeros(0)]
     for number, loop in enumerate(loops):
-        one, other = (_site_motion(model, data, name) for name in _sites(number))
+        first, other = (_site_motion(model, data, name) for name in _sites(number))
         rows = list(loop.components)
-        jacobians.append((one[2] - other[2])[rows])
-        errors.append(np.append(one[0] - other[0], rotation_error(other[1], one[1]))[rows])
-        biases.append((one[3] - other[3])[rows])
+        jacobians.append((first[2] - other[2])[rows])
+        errors.append(np.append(first[0] - other[0], rotation_error(other[1], first[1]))[rows])
+        biases.append((first[3] - other[3])[rows])
     return np.concatenate(jacobians), np.concatenate(errors), np.concatenate(biases)
 
 

@@ -61,7 +61,7 @@ class ReplayedLog:
             raise LogError(self.source, "time", f"windows of {length:g} s", accepted)
         gaps = np.cumsum(np.diff(self.time, prepend=self.time[0]) > _LONGEST_GAP * interval)
         stands = np.full(len(self.time), self.angular_velocity is None) | self.active.any(axis=1)
-        found, begin = list[tuple[int, int]](), 0
+        spans, begin = list[tuple[int, int]](), 0
         while begin < len(self.time) - 1:
             end = int(np.searchsorted(self.time, self.time[begin] + length - 0.5 * interval))
             if end >= len(self.time):
@@ -69,15 +69,15 @@ class ReplayedLog:
             if gaps[end] != gaps[begin]:
                 begin = int(np.searchsorted(gaps, gaps[begin] + 1))
             elif stands[begin]:
-                found.append((begin, end))
+                spans.append((begin, end))
                 begin = end
             else:
                 begin += 1
-        if not found:
+        if not spans:
             accepted = "a shorter window, or a longer log" + ("" if stands.all() else " of a robot that stands")
             raise LogError(self.source, "time", f"no {length:g} s without a gap", accepted)
-        chosen = np.linspace(0, len(found) - 1, min(len(found), _MOST_WINDOWS)).round().astype(int)
-        return np.array(found)[chosen]
+        chosen = np.linspace(0, len(spans) - 1, min(len(spans), _MOST_WINDOWS)).round().astype(int)
+        return np.array(spans)[chosen]
 
 
 @dataclass(frozen=True)
@@ -168,8 +168,8 @@ def replay_log(
         measured = _interpolated(starts + times, log.time, log.position)
         joints.append(_interpolated(times, since, position) - measured)
         if quaternion is not None and log.quat_xyzw is not None:
-            own = Slerp(since, Rotation.from_quat(quaternion, scalar_first=True))(np.minimum(times, since[-1]))
-            tilts.append((own.inv() * _orientation(log, starts + times)).magnitude())
+            simulated = Slerp(since, Rotation.from_quat(quaternion, scalar_first=True))(np.minimum(times, since[-1]))
+            tilts.append((simulated.inv() * _orientation(log, starts + times)).magnitude())
         if progress is not None:
             progress(1)
     return Drift(times, np.array(joints), np.array(tilts) if tilts else None)

@@ -338,8 +338,8 @@ class ReferenceMotion:
         """The setpoints, one per control step."""
         stance = self._stance
         n = self._moved.shape[2] - len(BODY)
-        rest = np.zeros((3, 3 + n))
-        rest[0] = [*stance.com, *stance.position[7:]]
+        standing = np.zeros((3, 3 + n))
+        standing[0] = [*stance.com, *stance.position[7:]]
         feet = np.zeros((len(stance.feet), 3, 3))
         feet[:, 0] = stance.feet
         turns = Rotation.from_rotvec(self._moved[0, :, 3:6]).as_matrix()
@@ -348,10 +348,10 @@ class ReferenceMotion:
             lifted = feet.copy()
             lifted[:, :, 2] += self._lift[:, i].T
             yield Setpoint(
-                com=rest[:, :3] + moved[:, :3],
+                com=standing[:, :3] + moved[:, :3],
                 base=turns[i],
                 base_rate=moved[1:, 3:6],
-                joints=rest[:, 3:] + moved[:, 6:],
+                joints=standing[:, 3:] + moved[:, 6:],
                 driven=self._driven,
                 feet=lifted,
                 load=self._load[i],

@@ -33,8 +33,8 @@ from torchid.report.analysis import (
     sets_table,
 )
 from torchid.report.log_checks import finding_table, group_alike, log_heading, skipped_checks_text
+from torchid.report.tables import LINES, labelled, rolling_lines, rows_within, wrap_words, written_line
 from torchid.sensor_planning.observability import BaseObservability
-from torchid.terminal.lines import LINES, labelled, rolling_lines, rows_within, wrap_words, written_line
 
 _MOST_ATTENTION, _TEXT_LINES = 2, 2
 _MOST_SCENARIOS = 4
@@ -42,7 +42,7 @@ _MOST_SCENARIOS = 4
 
 def analysis_lines(analysis: Analysis, width: int) -> list[str]:
     """The answer, in lines of at most so many columns, but for names that are longer."""
-    scenarios = sorted(analysis.scenarios, key=lambda one: -_lost(one))
+    scenarios = sorted(analysis.scenarios, key=lambda scenario: -_lost(scenario))
     lines = [*wrap_words(_headline(scenarios), width), ""]
     if len(scenarios) == 1:
         lines += labelled("determined", _determined_text(scenarios[0]), width, _TEXT_LINES + 1)
@@ -51,8 +51,8 @@ def analysis_lines(analysis: Analysis, width: int) -> list[str]:
         lines += _scenario_lines(scenarios, width)
     lines += rolling_lines(analysis.setup.rolling, width, 1)
     attention = list(_attention(analysis, scenarios))
-    for one in attention[:_MOST_ATTENTION]:
-        lines += labelled("attention", one, width, _TEXT_LINES)
+    for text in attention[:_MOST_ATTENTION]:
+        lines += labelled("attention", text, width, _TEXT_LINES)
     if len(attention) > _MOST_ATTENTION:
         lines += labelled("", f"and {len(attention) - _MOST_ATTENTION} more: --verbose", width)
     lines += _accuracy_lines(analysis.accuracies, LINES - len(lines) - 1, width)
@@ -100,10 +100,10 @@ def _headline(scenarios: Sequence[ScenarioAnalysis]) -> str:
     if lost := _lost(worst):  # planned sensors never lose it
         where = f"{lost} of {format_count(len(worst.states), 'contact state')}"
         if several:
-            bad = f"{sum(_lost(one) > 0 for one in scenarios)} of {len(scenarios)} scenarios"
+            bad = f"{sum(_lost(scenario) > 0 for scenario in scenarios)} of {len(scenarios)} scenarios"
             where = f"{bad}, first of all in {where} of {worst.name}"
         return f"The sensors of the file do not suffice: the base is lost in {where}"
-    count, states = len(worst.plan.chosen), sum(len(one.states) for one in scenarios)
+    count, states = len(worst.plan.chosen), sum(len(scenario.states) for scenario in scenarios)
     if worst.proposed is not None:
         sensors = "The sensors of the file suffice"
     elif several:
@@ -119,8 +119,8 @@ def _stack_headline(scenario: ScenarioAnalysis) -> str:
     """What sensors determine that are judged by all samples together."""
     plan, base = scenario.plan, scenario.base
     if scenario.proposed is not None:  # of a robot with a fixed base
-        found = f"{base.rank} combinations of {int(base.free.sum())} parameters"
-        return f"The sensors of the file determine at best {found}, all samples together"
+        combinations = f"{base.rank} combinations of {int(base.free.sum())} parameters"
+        return f"The sensors of the file determine at best {combinations}, all samples together"
     sensors = f"{len(plan.chosen)} of {len(plan.problem.candidates)} sensors"
     share = f"{plan.stack_rank} of the {plan.stack_full} inertial combinations that all would"
     return f"{sensors} determine {share}, all samples together"
@@ -139,23 +139,26 @@ def _determined_text(scenario: ScenarioAnalysis) -> str:
 
 def _smallest_text(scenario: ScenarioAnalysis) -> str:
     plan = scenario.plan
-    own = bool(scenario.proposed) and scenario.proposed is plan.observability
-    names = "that of the file" if own else candidate_names(plan.chosen)
+    is_own = bool(scenario.proposed) and scenario.proposed is plan.observability
+    names = "that of the file" if is_own else candidate_names(plan.chosen)
     aim = " for the inertia, friction aside" if plan.problem.criterion == "stack" else ""
     return f"{format_count(len(plan.chosen), 'sensor')}{aim}, cost {plan.cost:g}, {plan.proof}: {names}"
 
 
 def _scenario_lines(scenarios: Sequence[ScenarioAnalysis], width: int) -> list[str]:
-    states = [_judged_states(one) for one in scenarios]
-    lost = [f"{_lost(one)} of {len(of)} states" if of else "" for one, of in zip(scenarios, states, strict=True)]
+    states = [_judged_states(scenario) for scenario in scenarios]
+    lost = [
+        f"{_lost(scenario)} of {len(judged)} states" if judged else ""
+        for scenario, judged in zip(scenarios, states, strict=True)
+    ]
     columns = [
         ("base lost in", lost),
-        ("combinations", [f"{one.base.rank} of {int(one.base.free.sum())}" for one in scenarios]),
-        ("smallest set", [format_count(len(one.plan.chosen), "sensor") for one in scenarios]),
-        ("cost", [f"{one.plan.cost:g}" for one in scenarios]),
-        ("proven", ["yes" if one.plan.proven else "no" for one in scenarios]),
+        ("combinations", [f"{scenario.base.rank} of {int(scenario.base.free.sum())}" for scenario in scenarios]),
+        ("smallest set", [format_count(len(scenario.plan.chosen), "sensor") for scenario in scenarios]),
+        ("cost", [f"{scenario.plan.cost:g}" for scenario in scenarios]),
+        ("proven", ["yes" if scenario.plan.proven else "no" for scenario in scenarios]),
     ]
-    names = [one.name for one in scenarios]
+    names = [scenario.name for scenario in scenarios]
     return rows_within(
         ("scenario", names), columns, width, _MOST_SCENARIOS + 2, "scenarios more: analysis.json, --verbose"
     )
@@ -164,37 +167,37 @@ def _scenario_lines(scenarios: Sequence[ScenarioAnalysis], width: int) -> list[s
 def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Iterator[str]:
     """What the user should look at, the most urgent first."""
 
-    def named(one: ScenarioAnalysis, messages: Sequence[str]) -> Iterator[str]:
-        return (f"{one.name}: {message}" if len(scenarios) > 1 else message for message in messages)
+    def named(scenario: ScenarioAnalysis, messages: Sequence[str]) -> Iterator[str]:
+        return (f"{scenario.name}: {message}" if len(scenarios) > 1 else message for message in messages)
 
-    for one in scenarios:
-        yield from named(one, describe_losses(_judged_states(one)))
+    for scenario in scenarios:
+        yield from named(scenario, describe_losses(_judged_states(scenario)))
     if analysis.resting is not None:
         yield resting_message(analysis.resting)
     if analysis.setup.config.analysis.scenarios is None:
-        for one in scenarios:
-            found = analysis.accuracies.get("proposed" if one.proposed is not None else one.plan_label)
-            if found is not None and found.rank < one.base.rank:
-                what = f"the logs determine {found.rank} of {one.base.rank} combinations"
+        for scenario in scenarios:
+            accuracy = analysis.accuracies.get("proposed" if scenario.proposed is not None else scenario.plan_label)
+            if accuracy is not None and accuracy.rank < scenario.base.rank:
+                what = f"the logs determine {accuracy.rank} of {scenario.base.rank} combinations"
                 yield f"{what}: record motion that differs more, of all joints and of the base"
     yield from contradicting_messages(analysis.without)
     yield from confounded_messages(analysis.accuracies, in_short=True)
-    for one in scenarios:
-        yield from named(one, describe_singular_postures(_judged_states(one), beyond_logs=False))
+    for scenario in scenarios:
+        yield from named(scenario, describe_singular_postures(_judged_states(scenario), beyond_logs=False))
 
 
 def _accuracy_lines(sets: Mapping[str, SetAccuracy], room: int, width: int) -> list[str]:
     """A table of the errors of sensor sets, measured if there were test logs, in so many lines."""
-    if all(found.measured is None for found in sets.values()):
+    if all(accuracy.measured is None for accuracy in sets.values()):
         return []
     if room < _FEWEST_ROWS:
         return labelled("compared", f"{format_count(len(sets), 'sensor set')}: analysis.json, --verbose", width)
-    errors = [found.measured.rms for found in sets.values() if found.measured is not None]
+    errors = [accuracy.measured.rms for accuracy in sets.values() if accuracy.measured is not None]
     columns = [
-        (label, ["" if (rms := of.get(group)) is None else f"{rms:.3g}" for of in errors])
+        (label, ["" if (rms := rms_by_group.get(group)) is None else f"{rms:.3g}" for rms_by_group in errors])
         for group, label in ROW_GROUPS.items()
     ]
-    columns += [("rank", [str(found.rank) for found in sets.values()])]
+    columns += [("rank", [str(accuracy.rank) for accuracy in sets.values()])]
     names = ("rms error, measured", list(sets))
     return ["", *rows_within(names, columns, width, room - 1, "sensor sets more: analysis.json, --verbose")]
 
@@ -241,10 +244,10 @@ def check_lines(checked: Sequence[Checked], written: Sequence[str | None], width
     files = [written_line(name) for name in written if name]
     room = LINES - len([*head, *rolling, *skipped, *files])
     table = _FEWEST_ROWS if len(checked) > 1 else 0
-    found = _finding_lines(_alike(checked), room - table, width, len(checked))
-    logs = _log_lines(checked, room - len(found), width) if table else []
-    skipped = _skipped_lines(checked, _TEXT_LINES + max(room - len(found) - len(logs), 0), width)
-    return [*head, *found, *logs, *rolling, *skipped, *files]
+    finding_texts = _finding_lines(_alike(checked), room - table, width, len(checked))
+    logs = _log_lines(checked, room - len(finding_texts), width) if table else []
+    skipped = _skipped_lines(checked, _TEXT_LINES + max(room - len(finding_texts) - len(logs), 0), width)
+    return [*head, *finding_texts, *logs, *rolling, *skipped, *files]
 
 
 def finding_parts(checked: Sequence[Checked], written: Sequence[str | None], width: int) -> list[str | Table]:
@@ -283,13 +286,13 @@ def _alike(checked: Sequence[Checked]) -> list[_Alike]:
     """All findings, the most severe first, then what rejects whole logs, then what concerns most logs."""
     groups: dict[tuple[str, ...], dict[str, list[Finding]]] = {}
     for log in checked:
-        for found in group_alike(log.findings):
-            first = found[0]
-            kind = (first.severity, first.name, first.advice, *(finding.field for finding in found))
-            groups.setdefault(kind, {}).setdefault(str(log.log.source), []).extend(found)
+        for alike in group_alike(log.findings):
+            first = alike[0]
+            kind = (first.severity, first.name, first.advice, *(finding.field for finding in alike))
+            groups.setdefault(kind, {}).setdefault(str(log.log.source), []).extend(alike)
 
-    def urgency(one: _Alike) -> tuple[int, bool, int]:
-        return SEVERITIES.index(one.first.severity), not one.first.rejects_all, -len(one.by_log)
+    def urgency(group: _Alike) -> tuple[int, bool, int]:
+        return SEVERITIES.index(group.first.severity), not group.first.rejects_all, -len(group.by_log)
 
     return sorted(map(_Alike, groups.values()), key=urgency)
 
@@ -303,42 +306,42 @@ def _verdict(checked: Sequence[Checked]) -> str:
     if len(checked) == 1:
         usual = "; free of usual mistakes" if _is_clean(checked[0]) else ""
         return f"{log_heading(checked[0])}: {checked[0].verdict}{usual}"
-    clean, usable = (sum(map(of, checked)) for of in (_is_clean, lambda log: log.usable))
+    clean, usable = (sum(map(condition, checked)) for condition in (_is_clean, lambda log: log.usable))
     if clean == len(checked):
         return f"{clean} of {format_count(clean, 'log')} are free of usual mistakes"
     shortened = sum(log.usable and bool(log.rejected.any()) for log in checked)
-    some = f", {shortened} of them without some samples" if shortened else ""
+    without = f", {shortened} of them without some samples" if shortened else ""
     free = f"{clean or 'none'} {'is' if clean < 2 else 'are'} free of usual mistakes"
-    return f"{usable} of {format_count(len(checked), 'log')} {'is' if usable == 1 else 'are'} usable{some}; {free}"
+    return f"{usable} of {format_count(len(checked), 'log')} {'is' if usable == 1 else 'are'} usable{without}; {free}"
 
 
-def _finding_lines(found: Sequence[_Alike], room: int, width: int, logs: int) -> list[str]:
+def _finding_lines(groups: Sequence[_Alike], room: int, width: int, logs: int) -> list[str]:
     """The findings in at most so many lines, whole if they fit; else the last line counts what is not shown."""
     texts: list[list[str]] = []
     for most in (None, _TEXT_LINES):
-        texts = [_finding_text(one, width, logs, most) for one in found]
+        texts = [_finding_text(group, width, logs, most) for group in groups]
         lines = [line for text in texts for line in text]
-        is_whole = most is None and all(len(one.by_log) == 1 for one in found)
+        is_whole = most is None and all(len(group.by_log) == 1 for group in groups)
         end = [] if is_whole else ["all in full: --verbose"]
         if len(lines) + len(end) <= room:
             return lines + end
     shown = sum(last < room for last in accumulate(map(len, texts)))
-    return [*(line for text in texts[:shown] for line in text), _hidden_text(found[shown:])]
+    return [*(line for text in texts[:shown] for line in text), _hidden_text(groups[shown:])]
 
 
-def _finding_text(one: _Alike, width: int, logs: int, most: int | None) -> list[str]:
+def _finding_text(group: _Alike, width: int, logs: int, most: int | None) -> list[str]:
     """What was found in which logs, and what to do, each in at most so many lines."""
-    (log, findings), *others = one.by_log.items()
+    (log, findings), *others = group.by_log.items()
     where = f" in {log_title(log)}" if logs > 1 else ""
     if others:
         where += f", likewise {join_names([log_title(other) for other, _ in others], _NAMED - 1)}"
     fields = join_names(list(dict.fromkeys(finding.field for finding in findings)))
-    found = f"{fields}, {one.first.name}{where}: {one.first.found}"
-    return [*labelled(one.first.severity, found, width, most), *labelled("", f"do: {one.first.advice}", width, most)]
+    what = f"{fields}, {group.first.name}{where}: {group.first.found}"
+    return [*labelled(group.first.severity, what, width, most), *labelled("", f"do: {group.first.advice}", width, most)]
 
 
-def _hidden_text(found: Sequence[_Alike]) -> str:
-    counts = sum((one.severities for one in found), Counter[str]())
+def _hidden_text(groups: Sequence[_Alike]) -> str:
+    counts = sum((group.severities for group in groups), Counter[str]())
     named = (f"{count} {kind}{'s' * (kind == NOTE and count > 1)}" for kind in SEVERITIES if (count := counts[kind]))
     return f"and {', '.join(named)} more: --verbose"
 
@@ -376,7 +379,7 @@ def _skipped_lines(checked: Sequence[Checked], most: int, width: int) -> list[st
     texts = []
     for name, of_logs in reasons.items():
         alike = " or alike" if len(set(of_logs)) > 1 else ""
-        some = "" if len(of_logs) == len(checked) else f", {len(of_logs)} of {len(checked)} logs"
-        texts.append(f"{name} ({of_logs[0]}{alike}{some})")
+        where = "" if len(of_logs) == len(checked) else f", {len(of_logs)} of {len(checked)} logs"
+        texts.append(f"{name} ({of_logs[0]}{alike}{where})")
     text = f"{format_count(len(texts), 'check')}: {'; '.join(texts)}"
     return labelled("not checked", text, width, most) if texts else []

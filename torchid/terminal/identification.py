@@ -31,31 +31,29 @@ from torchid.problem.metrics import (
 )
 from torchid.report.parameter_files import table_of_draws
 from torchid.report.tables import (
-    contribution_table,
-    error_tables,
-    extra_table,
-    noise_advice,
-    state_table,
-    verdict_counts_table,
-    verdict_table,
-    violation_table,
-)
-from torchid.reprs import decimal
-from torchid.robot import Robot
-from torchid.sensing.sensors import minimized_errors
-from torchid.terminal.lines import (
     CUT,
     LABEL,
     LINES,
     column_lines,
+    contribution_table,
     error_lines,
+    error_tables,
+    extra_table,
     labelled,
+    noise_advice,
     noise_parts,
     rolling_lines,
     rows_within,
+    state_table,
+    verdict_counts_table,
+    verdict_table,
+    violation_table,
     wrap_words,
     written_line,
 )
+from torchid.reprs import decimal
+from torchid.robot import Robot
+from torchid.sensing.sensors import minimized_errors
 
 _MOST_ATTENTION, _TEXT_LINES, _ATTENTION_LINES = 2, 2, 3
 _FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
@@ -84,13 +82,13 @@ def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]
     lines += labelled("bodies", said.bodies, width, _TEXT_LINES)
     lines += labelled("terms", said.terms, width, 1) if said.terms else []
     lines += rolling_lines(run.experiment.rolling, width, _TEXT_LINES)
-    for one, most in zip(said.attention, (_ATTENTION_LINES, *[_TEXT_LINES] * (_MOST_ATTENTION - 1)), strict=False):
-        lines += labelled("attention", one, width, most)
+    for text, most in zip(said.attention, (_ATTENTION_LINES, *[_TEXT_LINES] * (_MOST_ATTENTION - 1)), strict=False):
+        lines += labelled("attention", text, width, most)
     if len(said.attention) > _MOST_ATTENTION:
         lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
     output = run.experiment.config.output
     end = [] if output is None else [written_line(output)]
-    end += [line for one in last for line in labelled(*one, width, _TEXT_LINES)]
+    end += [line for labelled_text in last for line in labelled(*labelled_text, width, _TEXT_LINES)]
     if len(lines) + len(end) > LINES:
         lines = [line for line in lines if not line.startswith(group_name(PRESSURE))]
     bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
@@ -271,17 +269,17 @@ def compression_parts(done: Compression, width: int, verbose: bool = False) -> l
 
 def compression_lines(files: Sequence[CompressedFile], width: int, most: int | None = None) -> list[str]:
     """How much was compressed to how little, and the files, in at most so many lines of at most so many columns."""
-    samples, size = (sum(x) for x in zip(*((one.samples, one.size) for one in files), strict=True))
+    samples, size = (sum(x) for x in zip(*((file.samples, file.size) for file in files), strict=True))
     said = f"{format_count(len(files), 'log')}, {format_count(samples, 'sample')}, in {size / 1e6:.3g} MB of factors"
     head = wrap_words(said, width)
     room = len(files) + 2 if most is None else most - len(head) - 1  # the folder
     columns = [
-        ("samples", [str(one.samples) for one in files]),
-        ("kB", [f"{one.size / 1e3:.0f}" for one in files]),
-        ("rows", [str(one.rows) for one in files]),
-        ("contact states", [str(one.states) for one in files]),
+        ("samples", [str(file.samples) for file in files]),
+        ("kB", [f"{file.size / 1e3:.0f}" for file in files]),
+        ("rows", [str(file.rows) for file in files]),
+        ("contact states", [str(file.states) for file in files]),
     ]
-    return [*head, *rows_within(("file", [one.name for one in files]), columns, width, room, "files more: --verbose")]
+    return [*head, *rows_within(("file", [file.name for file in files]), columns, width, room, "files more: --verbose")]
 
 
 MOST_LOGS = 8
@@ -295,18 +293,18 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
         evaluated: of one log or several.
         width: of the terminal.
     """
-    of = evaluated.robot.format
+    file_kind = evaluated.robot.format
     judged = [
-        ErrorComparison(name, pair.nominal, pair.identified, of, name in evaluated.at_rest)
+        ErrorComparison(name, pair.nominal, pair.identified, file_kind, name in evaluated.at_rest)
         for name, pair in evaluated.metrics.items()
     ]
     judged.sort(key=_worst, reverse=True)
-    shown = [_sentence(one, evaluated.explained) for one in judged[:MOST_LOGS]]
+    shown = [_sentence(errors, evaluated.explained) for errors in judged[:MOST_LOGS]]
     lines = [line for sentence in shown for line in wrap_words(sentence, width, "  ")]
     if len(judged) > MOST_LOGS:
         lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
     if len(judged) == 1:
-        lines += error_lines(judged[0].shown_errors(), width, of)
+        lines += error_lines(judged[0].shown_errors(), width, file_kind)
     for name, errors in evaluated.with_residual.items():
         without = evaluated.metrics[name].identified
         pairs = [(x, errors.rms_of(x), without.rms_of(x)) for x in ("joint_torque", WHITENED)]
@@ -326,15 +324,15 @@ def evaluation_parts(evaluated: EvaluatedRun, width: int) -> list[str | Table]:
     return [*error_tables(evaluated.metrics, evaluated.robot.format), written_line(evaluated.output)]
 
 
-def _sentence(one: ErrorComparison, explained: bool) -> str:
-    worse = worse_than_nominal({one.text: (one.nominal, one.identified)})
-    own = "" if explained else "; residuals of the run's own logs are not noise alone"
-    return f"WORSE THAN {one.of}: {describe_worse(worse, one.of)}" if worse else f"{one.headline()}{own}"
+def _sentence(errors: ErrorComparison, explained: bool) -> str:
+    worse = worse_than_nominal({errors.text: (errors.nominal, errors.identified)})
+    doubt = "" if explained else "; residuals of the run's own logs are not noise alone"
+    return f"WORSE THAN {errors.of}: {describe_worse(worse, errors.of)}" if worse else f"{errors.headline()}{doubt}"
 
 
-def _worst(one: ErrorComparison) -> float:
+def _worst(errors: ErrorComparison) -> float:
     """The largest error of a group as a share of the URDF's."""
-    return max((after / before if before else 1.0 for _, before, after, _ in one.errors()), default=0.0)
+    return max((after / before if before else 1.0 for _, before, after, _ in errors.errors()), default=0.0)
 
 
 _ENDS = (0.025, 0.5, 0.975)
@@ -355,9 +353,9 @@ def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list
         width,
         "  ",
     )
-    found = fitted.nominal_error
-    if found is not None and found.prior_is_narrow and drawn.prior_error < found.value:
-        lines += wrap_words(f"  {found}: ranges are too narrow; --prior-error auto takes that.", width, "  ")
+    nominal_error = fitted.nominal_error
+    if nominal_error is not None and nominal_error.prior_is_narrow and drawn.prior_error < nominal_error.value:
+        lines += wrap_words(f"  {nominal_error}: ranges are too narrow; --prior-error auto takes that.", width, "  ")
     numbers = _shown(drawn, table, verbose)
     ranges = np.quantile(table[:, numbers], ends, axis=0)
     names = [fitted.parameter_names[number] for number in numbers]

@@ -12,8 +12,8 @@ from torchid.commands.replay import Replay
 from torchid.commands.simulate import nominal_name, simulated_balls
 from torchid.config import SimulationConfig
 from torchid.errors import format_count, format_percent
+from torchid.report.tables import LINES, column_lines, labelled, rolling_lines, rows_within, wrap_words, written_line
 from torchid.simulation import Stability
-from torchid.terminal.lines import LINES, column_lines, labelled, rolling_lines, rows_within, wrap_words, written_line
 
 _TEXT_LINES = 2
 
@@ -124,5 +124,7 @@ def _drift(replayed: Replay) -> str:
     ]
     worse = any(after > before for before, after in drifts.values())
     head = f"WORSE THAN {replayed.of}: drift" if worse else "Drift"
-    of = f"of {replayed.driven} alone, as a share of the {replayed.of}'s"
-    return f"{head} after {replayed.window:g} s {of}: {', '.join(shares)} ({format_count(replayed.windows, 'window')})"
+    share = f"of {replayed.driven} alone, as a share of the {replayed.of}'s"
+    return (
+        f"{head} after {replayed.window:g} s {share}: {', '.join(shares)} ({format_count(replayed.windows, 'window')})"
+    )
