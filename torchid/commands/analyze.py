@@ -86,7 +86,8 @@ class ScenarioAnalysis:
         return _plan_label(self.name)
 
     def _headline(self) -> str:
-        plan, names = self.plan, join_names([sensor.name for sensor in self.plan.chosen])
+        plan = self.plan
+        names = join_names([sensor.name for sensor in self.plan.chosen])
         what = f"{len(plan.chosen)} sensors at a cost of {plan.cost:g} ({plan.proof}): {names}"
         return f"{self.name}, {len(self.states)} contact states, {what}"
 
@@ -119,7 +120,8 @@ class Analysis:
 
     def to_dict(self) -> dict[str, Any]:
         """What `analysis.json` has."""
-        names, scenarios = self.setup.robot.body_names, {}
+        names = self.setup.robot.body_names
+        scenarios = {}
         for scenario in self.scenarios:
             proposed = scenario.proposed
             scenarios[scenario.name] = sensor_plan_document(scenario.plan) | {
@@ -155,7 +157,8 @@ class AnalysisRequest:
     @classmethod
     def of(cls, setup: RobotSetup) -> AnalysisRequest:
         """The request of an experiment file. Raises InputError: a name that nothing has, or that is taken."""
-        settings, config = setup.config.analysis, setup.config
+        settings = setup.config.analysis
+        config = setup.config
         choice = settings.candidates
         with errors_at("analysis"):
             offered = candidates(
@@ -261,17 +264,20 @@ def analyze(config: AnalyzeConfig) -> Analysis:
 
 def _leave_out(request: AnalysisRequest, train: Sequence[Samples]) -> dict[str, Evidence]:
     """What leaving out each sensor of the file, or all of a kind, is worth to the prediction of the others."""
-    setup, sensors = request.setup, request.proposed
+    setup = request.setup
+    sensors = request.proposed
     if sensors is None or not train:
         return {}
-    robot, contacts = setup.robot, setup.contacts
+    robot = setup.robot
+    contacts = setup.contacts
     available = contained_candidates(contacts, sensors, candidates(robot, contacts, ft_sensors=robot.ft_names))
     dropped = {candidate.name: [candidate] for candidate in available}
     kinds = {candidate.kind: [other for other in available if other.kind == candidate.kind] for candidate in available}
     dropped |= {f"{ALL_OF}{kind}": members for kind, members in kinds.items() if 1 < len(members) < len(available)}
     sets = {}
     for name, members in dropped.items():
-        torque, wrench = sensors.torque.copy(), sensors.wrench.copy()
+        torque = sensors.torque.copy()
+        wrench = sensors.wrench.copy()
         for member in members:
             torque[list(member.dofs)] = False
             if member.contact is not None:
@@ -298,7 +304,8 @@ def _analysis_folder(output: Path) -> Path:
 
 
 def _read(request: AnalysisRequest, bars: Progress) -> tuple[list[Samples], list[Samples]]:
-    files, reader = request.setup.config.logs, LogReader(request.setup)
+    files = request.setup.config.logs
+    reader = LogReader(request.setup)
     if files is None:
         return [], []
     reading = bars.add_task("reading logs", total=len(files.train) + len(files.test))
@@ -338,7 +345,8 @@ def _plan_sensors(
     request: AnalysisRequest, states: tuple[ContactState, ...], train: Sequence[Samples], progress: StepCallback
 ) -> SensorPlan:
     """Plan the sensors of one scenario."""
-    setup, settings = request.setup, request.setup.config.analysis
+    setup = request.setup
+    settings = request.setup.config.analysis
     robot = setup.robot
     problem = PlanningProblem(
         robot=robot,
@@ -359,10 +367,13 @@ def _plan_sensors(
 
 def _analysis_of(request: AnalysisRequest, name: str, plan: SensorPlan, progress: StepCallback) -> ScenarioAnalysis:
     """A plan, with a check of the sensors that are proposed."""
-    setup, problem, contacts = request.setup, plan.problem, request.setup.contacts
+    setup = request.setup
+    problem = plan.problem
+    contacts = request.setup.contacts
     progress("base parameters", 0, 1)
     if request.proposed is None:
-        proposed, at_best = None, problem.stack.problem(sensor_set(setup.robot, contacts, plan.chosen))
+        proposed = None
+        at_best = problem.stack.problem(sensor_set(setup.robot, contacts, plan.chosen))
     else:
         proposed = plan.observability
         if not _is_chosen(plan, request.proposed, contacts):
@@ -390,7 +401,8 @@ def _sets_to_compare(
     request: AnalysisRequest, choices: Mapping[str, SensorPlan], train: Sequence[Samples]
 ) -> dict[str, SensorSet]:
     """Sensor sets to compare by accuracy: those with a name, and those planned for contact states of the logs."""
-    setup, sets = request.setup, dict(request.compared)
+    setup = request.setup
+    sets = dict(request.compared)
     recorded = {state for samples in train for state, _ in chunks_by_state(samples)}
     for name, choice in choices.items():
         known = any(_is_chosen(choice, other, setup.contacts) for other in sets.values())
@@ -425,8 +437,10 @@ def _is_chosen(choice: SensorPlan, sensors: SensorSet, contacts: Sequence[Contac
 
 def _write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -> None:
     """Write the folder; one that stands there may be replaced with `overwrite`."""
-    setup, names = analysis.setup, analysis.setup.robot.body_names
-    texts, figures = [], {}
+    setup = analysis.setup
+    names = analysis.setup.robot.body_names
+    texts = []
+    figures = {}
     for scenario in analysis.scenarios:
         which = "planned" if scenario.proposed is None else "proposed"
         texts.append(base_parameters_text(f"{scenario.name}, {which} sensors", scenario.base, names))
@@ -442,7 +456,8 @@ def _write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -
 
 def _picture(setup: RobotSetup, scenario: ScenarioAnalysis) -> Figure:
     """The robot's tree with the planned sensors."""
-    plan, robot = scenario.plan, setup.robot
+    plan = scenario.plan
+    robot = setup.robot
     sensors = sensor_set(robot, setup.contacts, plan.chosen)
     used = [c for c, *active in zip(setup.contacts, *scenario.states, strict=True) if any(active)]
     wrenches = {

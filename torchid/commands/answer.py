@@ -69,7 +69,8 @@ class ErrorComparison:
     def errors(self, groups: Sequence[str] = DECISIVE_GROUPS) -> Iterator[tuple[str, float, float, float | None]]:
         """Groups of rows with both errors, and what noise of the readings leaves."""
         for group in groups:
-            before, after = self.nominal.rms_of(group), self.identified.rms_of(group)
+            before = self.nominal.rms_of(group)
+            after = self.identified.rms_of(group)
             if before is not None and after is not None:
                 yield group, before, after, self.identified.noise.get(group)
 
@@ -78,7 +79,8 @@ class ErrorComparison:
         ratios = [after / before if before else 1.0 for _, before, after, _ in self.errors()]
         if not ratios:
             return f"Nothing to compare with the {self.of} on {self.text}"
-        least, most = min(ratios), max(ratios)
+        least = min(ratios)
+        most = max(ratios)
         shares = f"{format_percent(least)} to " * (most > 1.1 * least) + f"{format_percent(most)} %"
         within = (text for limits, text in _VERDICTS.items() if least < limits[0] and most < limits[1])
         verdict = next(within, _NO_BETTER)
@@ -93,7 +95,8 @@ class ErrorComparison:
         if worse:
             where = f"better in {better} of {parts} joints and base axes, worse in {join_names(worse, 1)}"
             return f"Mixed, against the {self.of} on {self.text}: {where}"
-        words, part = verdict.removesuffix(_IN_PART), _IN_PART * verdict.endswith(_IN_PART)
+        words = verdict.removesuffix(_IN_PART)
+        part = _IN_PART * verdict.endswith(_IN_PART)
         return f"{words} than the {self.of}{part} on {self.text}: errors of {shares} of the {self.of}'s{floor}"
 
     def shown_errors(self) -> list[tuple[str, float, float, float | None]]:
@@ -150,7 +153,9 @@ def answer(run: Results) -> Answer:
 
 def summary_lines(run: Results) -> list[str]:
     """What a run is and found, in at most ten lines."""
-    robot, estimate, config = run.experiment.robot, run.estimate, run.experiment.config
+    robot = run.experiment.robot
+    estimate = run.estimate
+    config = run.experiment.config
     counts = ", ".join(f"{count} {verdict}" for verdict, count in estimate.verdict_counts().items() if count)
     said = [("data", f"{format_count(run.samples, 'sample')} of {format_count(len(config.logs.train), 'log')}")]
     said += [("parameters", f"{estimate.phi.size}: {counts}")]
@@ -174,7 +179,8 @@ def summary_lines(run: Results) -> list[str]:
 
 
 def _total_mass(run: Results) -> str:
-    gain, file_kind = run.experiment.config.sensors.gain_error, run.experiment.robot.format
+    gain = run.experiment.config.sensors.gain_error
+    file_kind = run.experiment.robot.format
     counted = run.mass.determined and run.estimate.gain_error is not None and run.estimate.gain_error.any()
     gains = f"; ± counts gain errors of {100.0 * gain:g} %" if counted else ""
     return f"{run.mass} ({file_kind}: {decimal(run.mass.nominal)} kg{gains})"
@@ -206,7 +212,8 @@ def _headline(run: Results, judged: ErrorComparison) -> str:
 
 
 def _bodies_text(run: Results) -> str:
-    names, robot = [], run.experiment.robot
+    names = []
+    robot = run.experiment.robot
     for violation in run.violations:
         if violation.body is not None and robot.body_names[violation.body] not in names:
             names.append(robot.body_names[violation.body])
@@ -225,7 +232,9 @@ def _bodies_text(run: Results) -> str:
 
 def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
     """What the user should look at: conditions with what they mean and what to do, the most urgent first."""
-    mass, file_kind, estimate = run.mass, run.experiment.robot.format, run.estimate
+    mass = run.mass
+    file_kind = run.experiment.robot.format
+    estimate = run.estimate
     terms = [violation.term for violation in run.violations if violation.term is not None]
     least = estimate.relative_increase if isinstance(estimate, ConsistentEstimate) else None
     growth = np.sqrt(1.0 + (least or 0.0))
@@ -304,7 +313,8 @@ def _unlike_sensors(identified: Metrics) -> Iterator[str]:
             name = group_name(group) if in_limb else "forces without those of the contacts"
             whose = "the sensor's sign, unit and frame" if in_limb else "signs, units and order of joints"
             yield f"{name}: errors of {share:.2g} times what was measured; check {whose}: torchid check"
-    share, of_weight = identified.base_force_of_variation, identified.relative_of("base_force")
+    share = identified.base_force_of_variation
+    of_weight = identified.relative_of("base_force")
     if share is not None and share > _LARGER_THAN_MEASURED and (of_weight or 0.0) > MAX_MASS_ERROR:
         ratio = f"base force: errors of {share:.2g} times what its measurements vary by"
         yield f"{ratio}; check frames, signs and units of contact forces and of the base's pose: torchid check"
@@ -320,7 +330,8 @@ def _computed(judged: ErrorComparison) -> Iterator[str]:
 
 def _heavy(run: Results) -> Iterator[str]:
     """Bodies beyond `_HEAVY` times their mass in the robot's file, which their own interval does not exclude."""
-    robot, estimate = run.experiment.robot, run.estimate
+    robot = run.experiment.robot
+    estimate = run.estimate
     mass, error = (x.reshape(-1, PER_BODY)[:, 0] for x in (estimate.phi, estimate.standard_error))
     nominal = robot.nominal[:, 0]
     known = (estimate.verdict.reshape(-1, PER_BODY)[:, 0] == IDENTIFIED) & (mass - nominal > 2.0 * error)
@@ -342,7 +353,8 @@ def _driving(run: Results) -> Iterator[str]:
 
 def _implicit(run: Results) -> Iterator[str]:
     """That armatures are those which a simulator's implicit integration of a PD law adds, where its kd is stated."""
-    logs, robot = run.experiment.config.logs, run.experiment.robot
+    logs = run.experiment.config.logs
+    robot = run.experiment.robot
     torque = logs.columns.joint_torque if logs.columns else None
     if run.forces is None or torque is None or torque.pd is None or torque.pd.kd is None:
         return

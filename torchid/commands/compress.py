@@ -189,7 +189,8 @@ def _checksum(path: Path) -> str:
 
     So are files that are joined otherwise.
     """
-    whole, part = file_checksum(*log_files(path)), split_range(path)
+    whole = file_checksum(*log_files(path))
+    part = split_range(path)
     text = ("" if part.range is None else part.range.text) + part.kind * part.joins
     return hashlib.sha256(f"{whole}{text}".encode()).hexdigest() if text else whole
 

@@ -39,7 +39,8 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
     Warns:
         TorchidWarning: what the format cannot say, or what simulators will refuse.
     """
-    folder, target = Path(run), None if output is None else Path(output)
+    folder = Path(run)
+    target = None if output is None else Path(output)
     if form not in EXPORT_FORMATS:
         raise ConfigError("command line", "--format", f"'{form}'", ", ".join(EXPORT_FORMATS))
     fitted = read_run(folder)
@@ -47,7 +48,8 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
         check_free_file(target, "--output", overwrite, [folder, *inputs_of(fitted.experiment.config)])
     if fitted.learned is not None:
         warn(f"{form}: bodies and friction alone; the learned module goes by torch.export of torchid.RigidPlusResidual")
-    robot, identified = fitted.experiment.robot, fitted.calibrations.identified
+    robot = fitted.experiment.robot
+    identified = fitted.calibrations.identified
     joints = FittedJoints.of(identified.of_joints, identified.builder.tree.stribeck)
     text = robot_text(form, robot, identified.phi.reshape(-1, PER_BODY), joints, folder)
     if target is not None:

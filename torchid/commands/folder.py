@@ -266,7 +266,8 @@ def require_replaceable(folder: Path, kind: FolderKind, output: Path | None = No
     output = output or folder
     accepted = f"a new folder, or {kind.name} to overwrite"
     try:
-        contents, names = inspect_folder(folder, kind), [excerpt(name) for name in sorted(os.listdir(folder))]
+        contents = inspect_folder(folder, kind)
+        names = [excerpt(name) for name in sorted(os.listdir(folder))]
     except OSError as error:
         raise ConfigError(output, "output", f"cannot be read ({error})", "a new folder") from error
     if contents is None and (other := read_manifest(folder)):

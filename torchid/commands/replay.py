@@ -175,7 +175,8 @@ def replay(
         InputError: the folder is no run, MuJoCo is not installed or refuses the robot, or the log lacks fields.
     """
     _require_accepted(window, samples)
-    folder, out = Path(run), None if output is None else Path(output)
+    folder = Path(run)
+    out = None if output is None else Path(output)
     require_run(folder)
     if out is not None:
         check_free(out, overwrite, REPLAY, [folder, *(file.path for file in split_range(log).files)])
@@ -233,7 +234,8 @@ def _replayed_pairs(
     fitted: FittedRun, samples: Samples, folder: Path
 ) -> tuple[Comparison[ReplayedLog], Comparison[Model]]:
     """What drives the robot of its file and the identified one, and both."""
-    robot, calibration = fitted.experiment.robot, fitted.calibrations.identified
+    robot = fitted.experiment.robot
+    calibration = fitted.calibrations.identified
     logs = Comparison(*(_replayed(log) for log in (samples, *calibration.calibrate([samples]))))
     joints: dict[str, dict[str, float]] = {what: {} for what in ACTUATORS}
     for extra, value in calibration.of_joints:
@@ -247,7 +249,8 @@ def _drawn(fitted: FittedRun, run: Path, count: int) -> Iterator[Model]:
     """Robots drawn from the posterior of a run, always the same ones."""
     if not count:
         return
-    robot, stribeck = fitted.experiment.robot, fitted.experiment.terms.stribeck
+    robot = fitted.experiment.robot
+    stribeck = fitted.experiment.terms.stribeck
     posterior = read_posterior(run)
     sampler = PosteriorSampler(posterior, posterior.prior_error(PRIOR_ERROR))
     samples = sampler.sample(count, torch.Generator().manual_seed(0))
@@ -286,7 +289,8 @@ def _joint_gains(robot: Robot, option: str, stated: float | Mapping[str, float])
         UnknownNameError: a joint that does not exist.
         ConfigError: a pattern that matches none, or a gain that is negative.
     """
-    out, by_name = np.zeros(robot.n), stated if isinstance(stated, Mapping) else {"*": stated}
+    out = np.zeros(robot.n)
+    by_name = stated if isinstance(stated, Mapping) else {"*": stated}
     for key, gain in by_name.items():
         if not 0.0 <= gain < np.inf:
             raise ConfigError("command line", option, f"{gain:g}", _GAIN)

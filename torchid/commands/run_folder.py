@@ -129,7 +129,8 @@ def write_run(
     Raises:
         ConfigError: the folder exists and may not be replaced.
     """
-    config, robot = replace(run.experiment.config, output=output), run.experiment.robot
+    config = replace(run.experiment.config, output=output)
+    robot = run.experiment.robot
     run = replace(run, experiment=replace(run.experiment, config=config))
     with during("writing", output), new_folder(output, overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
@@ -150,7 +151,8 @@ def write_run(
 
 def _metrics_document(run: Identification) -> dict[str, object]:
     """What `metrics.json` holds: errors of the identified and of the nominal parameters."""
-    estimate, robot = run.estimate, run.experiment.robot
+    estimate = run.estimate
+    robot = run.experiment.robot
     document: dict[str, object] = {}
     for name in LOG_SETS:
         pair = run.metrics.get(name)
@@ -227,7 +229,8 @@ def _factor_entry(factors: FactorFile) -> dict[str, object]:
 
 def _identifiability_document(run: Identification) -> dict[str, object]:
     """What the data determine, and what each log and sensor adds; contact states have a list of their own."""
-    estimate, contributions = run.estimate, run.contributions
+    estimate = run.estimate
+    contributions = run.contributions
     return {
         "singular_values": estimate.singular_values.tolist(),
         "condition_number": estimate.condition_number if estimate.rank else None,
@@ -256,7 +259,8 @@ Figures = dict[str, Callable[[], "Figure"]]
 
 def run_figures(run: Results) -> Figures:
     """Those of a run, in the order in which they are to be seen."""
-    robot, estimate = run.experiment.robot, run.estimate
+    robot = run.experiment.robot
+    estimate = run.estimate
     kinds = {body.joint.kind for body in robot.bodies if body.joint is not None}
     figures = Figures() if run.forces is None else force_figures(run.forces, robot)
     if run.traces is not None:
@@ -278,7 +282,8 @@ def run_figures(run: Results) -> Figures:
 
 def force_figures(series: ForceSeries, robot: Robot) -> Figures:
     """Those of forces of a log's first samples, as far as these are measured."""
-    figures, args = Figures(), (robot.dof_names, robot.base_rows, robot.sliding, robot.format)
+    figures = Figures()
+    args = (robot.dof_names, robot.base_rows, robot.sliding, robot.format)
     if series.known:
         figures["forces"] = partial(force_figure, series, *args)
     if series.pressure is not None and np.isfinite(series.pressure[0]).any():
@@ -298,7 +303,8 @@ def _bits(contributions: Contributions) -> dict[str, list[tuple[str, float]]]:
 
 def draw_figures(run: Results, folder: Path) -> dict[str, bytes]:
     """Draw the figures of a run to files in a folder, on all cores; PNG of them by name, in their order."""
-    figures, form = run_figures(run), run.experiment.config.figures.format
+    figures = run_figures(run)
+    form = run.experiment.config.figures.format
     files = [(folder / f"{name}.{form}", make) for name, make in figures.items()]
     drawn = share_between_forks(files, lambda file: draw_for(*file), thread_count())
     for (path, _), figure in zip(files, drawn, strict=True):
@@ -316,7 +322,8 @@ def write_events(run: Results, folder: Path, figures: Mapping[str, bytes]) -> No
     """
     from torchid.report.tensorboard import RunEvents  # takes 0.3 s, which runs that write nothing need not
 
-    estimate, robot = run.estimate, run.experiment.robot
+    estimate = run.estimate
+    robot = run.experiment.robot
     descent = isinstance(estimate, SgdEstimate)
     last = estimate.epochs if isinstance(estimate, SgdEstimate) else 1
     with RunEvents(folder) as events:
@@ -349,7 +356,8 @@ def _errors(run: Results, nominal: bool) -> dict[str, Metrics]:
 
 def _answer_lines(run: Results) -> list[str]:
     """What the terminal says first."""
-    said, file_kind = answer(run), run.experiment.robot.format
+    said = answer(run)
+    file_kind = run.experiment.robot.format
     errors = [
         f"{group}: {before:.4g} by the {file_kind}, {after:.4g} identified"
         + ("" if floor is None else f", {floor:.4g} noise")
@@ -378,7 +386,8 @@ def hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
 
     It shows the first five by name at first: what most runs have in common comes after them.
     """
-    estimator, training = config.estimator, config.estimator.training
+    estimator = config.estimator
+    training = config.estimator.training
     descent = estimator.name == "sgd"
     return {
         "cutoff_hz": config.preprocessing.filter_hz or 0.0,
@@ -433,7 +442,8 @@ def report(run: str | Path) -> Path:
     manifest = read_manifest(folder)
     if manifest is None or manifest.kind != RUN.name:
         raise ConfigError(folder, "RUN", "no run of torchid", _WRITTEN)
-    page, written = folder / PAGE, manifest.files.get(PAGE)
+    page = folder / PAGE
+    written = manifest.files.get(PAGE)
     there = page.exists() or page.is_symlink()
     if there and (page.is_symlink() or not page.is_file() or written is None or file_checksum(page) != written):
         raise ConfigError(folder, PAGE, "changed since torchid wrote it", f"a run without {PAGE}: move it elsewhere")

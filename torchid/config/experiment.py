@@ -289,7 +289,8 @@ def _loaded(
     given = plain_sections(sections or {})
     if path is None:
         return load(kind, None, overrides, {"output": None} | given), nullcontext()
-    config, about = load(kind, Path(path), overrides, given), about_file(path)
+    config = load(kind, Path(path), overrides, given)
+    about = about_file(path)
     if config.output is None and given.get("output", config) is not None:  # left empty in the file or by the shell
         raise ConfigError(path, "output", "found None", "a path")
     return config, about
@@ -303,7 +304,8 @@ def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:
 
 def _check_threshold(settings: PreprocessingConfig) -> None:
     """Refuse two sources of contact flags, and a threshold below that is above."""
-    threshold, key = settings.contact_threshold, "preprocessing.contact_threshold"
+    threshold = settings.contact_threshold
+    key = "preprocessing.contact_threshold"
     if threshold is None:
         return
     if settings.detect_contacts is not None:
@@ -316,7 +318,8 @@ def _check_threshold(settings: PreprocessingConfig) -> None:
 
 def _check_extras(config: _Common) -> None:
     """Refuse the same extra parameter under two keys, and extra parameters for a descent, which has none."""
-    actuators, sensors = config.actuators, config.sensors
+    actuators = config.actuators
+    sensors = config.sensors
     if actuators.torque_offset is True and "joint_torque" in sensors.offsets:
         found = "set together with sensors.offsets.joint_torque, which is the same"
         raise ConfigError.at_field("actuators.torque_offset", found, "one of the two")

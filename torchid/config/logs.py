@@ -117,7 +117,8 @@ def _add_payloads(payloads: dict[str, Any], field: str, entry: object) -> None:
     """Add the payloads of an entry, as settings, by the name of its log."""
     if not isinstance(entry, Mapping) or "payload" not in entry:
         return
-    field, given = f"{field}.payload", entry["payload"]
+    field = f"{field}.payload"
+    given = entry["payload"]
     several = given if isinstance(given, list) else [given]
     new = [_payload(field if given is not several else f"{field}.{k}", one) for k, one in enumerate(several)]
     file = _file(field, entry)
@@ -153,7 +154,8 @@ def _names(field: str, entry: object) -> Iterator[object]:
     for key in entry:
         if key not in _KEYS:
             raise UnknownNameError.at_field(field, str(key), _KEYS)
-    file, folds = _file(field, entry), [key for key in ("fold", "without_fold") if key in entry]
+    file = _file(field, entry)
+    folds = [key for key in ("fold", "without_fold") if key in entry]
     bounds = [key for key in ("from", "to") if key in entry]
     if len(folds) + bool(bounds) > 1 or ("of" in entry and not folds):
         found = f"{' and '.join([*folds, *bounds, *(['of'] if not folds else [])])} together"
@@ -192,7 +194,8 @@ def _joined(field: str, entry: object) -> LogFile:
     for key in given:
         if key not in keys:
             raise UnknownNameError.at_field(field, str(key), keys)
-    file, shift = given.get("file"), given.get("shift_s", 0.0)
+    file = given.get("file")
+    shift = given.get("shift_s", 0.0)
     if not isinstance(file, str) or not file or JOINED in file:
         raise ConfigError.at_field(field, f"found {excerpt(repr(entry))}", _FILES)
     if isinstance(shift, bool) or not isinstance(shift, (int, float)) or not math.isfinite(shift):
@@ -261,7 +264,8 @@ def _resolved_payloads(logs: LogsConfig) -> dict[str, list[Payload]]:
     for name, payloads in logs.payloads.items():
         field = "logs.payloads"
         if not Path(name).is_absolute():
-            found, accepted = f"{name}, a relative path", "payload: {...} in an entry of logs.train or logs.test"
+            found = f"{name}, a relative path"
+            accepted = "payload: {...} in an entry of logs.train or logs.test"
             raise ConfigError.at_field(field, found, accepted)
         for path in _matching(field, [Path(name)]):
             if path.suffix == FACTORS:
@@ -490,7 +494,9 @@ def _kind(settings: type[T], key: str, example: str) -> FileKind[T]:
         logs = settings.get("logs")
         return {"logs": {name: x for name, x in logs.items() if name == key} if isinstance(logs, dict) else {}}
 
-    name, keys, example = "experiment", f"logs.{key}", f"logs.{key}.{example}"
+    name = "experiment"
+    keys = f"logs.{key}"
+    example = f"logs.{key}.{example}"
     return FileKind(
         settings=settings, name=name, keys=keys, list_example=example, prepare=prepare, accepted=MAPS_ACCEPTED
     )

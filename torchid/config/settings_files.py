@@ -114,7 +114,8 @@ def check_text(value: str) -> None:
 
 def explain_syntax(error: yaml.MarkedYAMLError, text: str, wanted: str) -> tuple[str, str]:
     """What a reader of YAML found, by line, and what is accepted in its place; `wanted`: what the text should be."""
-    mark, lines = error.problem_mark or error.context_mark, text.splitlines()
+    mark = error.problem_mark or error.context_mark
+    lines = text.splitlines()
     if mark is None:
         return excerpt(str(error)), wanted
     line, where = lines[mark.line] if mark.line < len(lines) else "", f"line {mark.line + 1}"

@@ -186,7 +186,8 @@ def describe_losses(states: Sequence[BaseObservability]) -> list[str]:
     for lost in (state.lost for state in states if state.lost is not None):
         by_loss.setdefault((lost.descriptions, lost.unmet_groups, lost.remedies), []).append(lost)
     for alike in by_loss.values():
-        lost, count = alike[0], f"{len(alike)} of {format_count(len(states), 'contact state')}"
+        lost = alike[0]
+        count = f"{len(alike)} of {format_count(len(states), 'contact state')}"
         lacking = [
             f"{' + '.join(frames)} lacks {format_count(number, 'sensor')}" for frames, number in lost.unmet_groups
         ]
@@ -203,7 +204,8 @@ def describe_singular_postures(states: Sequence[BaseObservability], beyond_logs:
 
     `beyond_logs`: whether postures count that the logs, if there are any, do not have.
     """
-    messages, kept = [], [state for state in states if state.lost is None]
+    messages = []
+    kept = [state for state in states if state.lost is None]
     near = [state.recorded.least for state in kept if state.recorded and state.recorded.least < _MIN_SINGULAR_VALUE]
     if near:
         where = f"at some postures of the logs the base is nearly lost (smallest singular value {min(near):.2g})"

@@ -113,7 +113,8 @@ class Drawn:
 def draw_for(path: Path, make: Callable[[], Figure]) -> Drawn:
     """A figure that a function makes, for a file of a type by its extension."""
     with during("drawing", path):
-        figure, form = make(), path.suffix[1:]
+        figure = make()
+        form = path.suffix[1:]
         file = figure_bytes(figure, form)
         return Drawn(file, file if form == "png" else figure_bytes(figure, "png"))
 

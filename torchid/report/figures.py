@@ -184,7 +184,8 @@ def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str]
     for number, log in enumerate(logs := [log for log in colors if any(x.log == log for x in extras)]):
         points = [x for x in extras if x.log == log]
         offset = 0.15 * (number % _LANES - (min(len(logs), _LANES) - 1) / 2)
-        values, index = [x.value for x in points], [rows.index(x.extra.label) + offset for x in points]
+        values = [x.value for x in points]
+        index = [rows.index(x.extra.label) + offset for x in points]
         error = [min(INTERVAL * x.standard_error, _ENDLESS * longest) for x in points]
         axis.errorbar(values, index, xerr=error, fmt="none", ecolor=colors[log], elinewidth=1.0)
         faces = [colors[log] if x.separable else "white" for x in points]
@@ -200,8 +201,10 @@ def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str]
 def _leave_room(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str]) -> None:
     """Cut the axis off where confounded values would leave those that are known no room; an arrow has what is cut."""
     bars = [(x.value, INTERVAL * x.standard_error) for x in extras if x.separable and math.isfinite(x.standard_error)]
-    low, high = min((v - e for v, e in bars), default=0.0), max((v + e for v, e in bars), default=0.0)
-    low, high = min(low, 0.0), max(high, 0.0)
+    low = min((v - e for v, e in bars), default=0.0)
+    high = max((v + e for v, e in bars), default=0.0)
+    low = min(low, 0.0)
+    high = max(high, 0.0)
     left, right = axis.get_xlim()
     if not high > low or right - left <= _MAX_ERROR_RATIO * (high - low):
         return
@@ -456,15 +459,18 @@ def _positions(robot: Robot, contacts: Sequence[Contact]) -> tuple[list[Position
     frames: list[list[str]] = [[] for _ in robot.bodies]
     for contact in contacts:
         frames[robot.link(contact.frame)[0]].append(contact.frame)
-    children, row = robot.children, [0] * len(robot.bodies)
+    children = robot.children
+    row = [0] * len(robot.bodies)
     for body, link in enumerate(robot.bodies[1:], start=1):
         row[body] = row[link.parent] + 1 + len(frames[link.parent])
-    column, free = [0.0] * len(robot.bodies), 0
+    column = [0.0] * len(robot.bodies)
+    free = 0
     for body in reversed(range(len(robot.bodies))):  # children come after their parents
         if children[body]:
             column[body] = 0.5 * (column[children[body][0]] + column[children[body][-1]])
         else:
-            column[body], free = float(free), free + 1
+            column[body] = float(free)
+            free = free + 1
     bodies = [(max(column) - x, y) for x, y in zip(column, row, strict=True)]
     below = {name: (x, y + k) for (x, y), at in zip(bodies, frames, strict=True) for k, name in enumerate(at, start=1)}
     return bodies, below
@@ -480,11 +486,14 @@ def _draw_joint(
 ) -> None:
     name = joint.name if joint.mimic is None else joint.mimic.master
     weld = [k for k in WRENCH_COMPONENTS if f"{name}.{k}" in readings] if joint.kind == "fixed" else []
-    loaded, measured = name in constrained, bool(weld) or name in readings
-    (x, y), bend = position, parent[1] + 0.5
+    loaded = name in constrained
+    measured = bool(weld) or name in readings
+    (x, y) = position
+    bend = parent[1] + 0.5
     style: dict[str, Any] = {"color": _LOADED if loaded else _PLAIN, "linewidth": 2.2 if loaded else 1.4, "zorder": 0}
     axes.plot([parent[0], parent[0], x, x], [parent[1], bend, bend, y], **style)
-    color, part = _LIMB if weld else _TORQUE, 0 < len(weld) < len(WRENCH_COMPONENTS)
+    color = _LIMB if weld else _TORQUE
+    part = 0 < len(weld) < len(WRENCH_COMPONENTS)
     face = color if measured else "white"
     style = {"color": color if measured else "0.5", "markerfacecolor": face, "fillstyle": "left" if part else "full"}
     axes.plot(x, y, "h" if joint.kind == "fixed" else "o", markersize=8 if joint.kind == "fixed" else 7, **style)

@@ -285,7 +285,8 @@ def _spans(time: Array, state: np.ndarray) -> list[tuple[float, float, int]]:
     steps = np.diff(time)
     gap = steps > _GAP * np.median(steps) if len(steps) else np.zeros(0, bool)
     changes = np.flatnonzero((np.diff(state) != 0) | gap)
-    first, last = np.append(0, changes + 1), np.append(changes, len(time) - 1)
+    first = np.append(0, changes + 1)
+    last = np.append(changes, len(time) - 1)
     after = np.append(gap, True)[last]  # a stay lasts until the next sample, unless that is far
     end = time[np.where(after, last, np.minimum(last + 1, len(time) - 1))]
     order = np.sort(np.argsort(time[first] - end)[:_MOST_SPANS])
@@ -322,7 +323,8 @@ def _longest_segment(time: Array, known: np.ndarray) -> slice:
     """Samples in a row that are known and without a gap."""
     steps = np.diff(time)
     breaks = np.append(steps > _GAP * np.median(steps), True) if len(steps) else np.ones(len(time), bool)
-    best, start = slice(0, 0), 0
+    best = slice(0, 0)
+    start = 0
     for number in range(len(time)):
         if not known[number]:
             start = number + 1

@@ -90,7 +90,8 @@ def _draw_panel(axes: Axes, checked: Checked) -> None:
     for finding in _marked_findings(checked):
         style: dict[str, Any] = {"color": COLORS[finding.severity], "alpha": 0.6, "linewidth": 0}
         for span in finding.spans:
-            start, end = float(time[span.first]), float(time[span.last])
+            start = float(time[span.first])
+            end = float(time[span.last])
             width = max(end - start, _MIN_MARK_SHARE * time[-1])
             for (field, name), height in zip(channels, heights, strict=True):
                 if finding.field in (field, "time") and span.channel in ("", name):

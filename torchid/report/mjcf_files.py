@@ -209,11 +209,15 @@ class _Model:
         springs: Mapping[str, tuple[float, float]],
         meshes: bool,
     ) -> None:
-        self.robot, self.armature, self.springs, self.meshes = robot, armature, springs, meshes
+        self.robot = robot
+        self.armature = armature
+        self.springs = springs
+        self.meshes = meshes
         self.phi, self._beyond = share_with_links_beyond_welds(robot, phi)
         self.left_out: list[str] = []
         links, joints = read_urdf(robot.path)
-        self._links, self._joints = {link.name: link for link in links}, joints
+        self._links = {link.name: link for link in links}
+        self._joints = joints
         self._shapes = {link.get("name"): link for link in parse_xml(robot.path).getroot().findall("link")}
         self._limits = position_limits(robot.path)
         mimics = resolve_mimics(robot.path, joints)
@@ -292,7 +296,8 @@ class _Model:
                 etree.SubElement(equality, tag, sites, name=f"loop{number}")
 
     def _add_shape(self, body: etree._Element, shape: etree._Element, kind: str) -> None:
-        origin, geometry = shape.find("origin"), shape.find("geometry")
+        origin = shape.find("origin")
+        geometry = shape.find("geometry")
         form = None if geometry is None else next((x for x in geometry if isinstance(x.tag, str)), None)
         if form is None:
             return

@@ -192,10 +192,12 @@ def ranges_document(fitted: FittedPosterior, samples: ParameterSamples, about: M
         about: numbers that say how they were drawn.
     """
     table = table_of_draws(samples)
-    mean, deviation = table.mean(axis=0), table.std(axis=0)
+    mean = table.mean(axis=0)
+    deviation = table.std(axis=0)
     moving = np.flatnonzero(np.append(fitted.posterior.free, np.ones(len(fitted.extra_names), dtype=bool)))
     quantiles = np.quantile(table[:, moving], QUANTILES, axis=0)
-    names, units = fitted.parameter_names, _units(fitted)
+    names = fitted.parameter_names
+    units = _units(fitted)
     ranges = {}
     for column, number in enumerate(moving.tolist()):
         nominal = float(fitted.posterior.nominal[number]) if number < len(fitted.posterior.nominal) else None

@@ -57,7 +57,8 @@ class FittedJoints:
         Warns:
             TorchidWarning: offsets that are lost, and springs that MuJoCo does not take.
         """
-        springs, lost = dict[str, tuple[float, float]](), []
+        springs = dict[str, tuple[float, float]]()
+        lost = []
         masters = {body.joint.mimic.master for body in robot.bodies if body.joint is not None and body.joint.mimic}
         for number, name in enumerate(robot.joint_names):
             if name not in self.stiffness and name not in self.torque_offset:
@@ -154,7 +155,8 @@ def joint_parameters(robot: Robot, phi: Array, fitted: FittedJoints) -> list[Joi
         fitted: what else was found of joints; those whose armature was not fitted have that of the robot's file.
     """
     ratio = np.abs(robot.joint_map[0])
-    coulomb, viscous = ratio.T @ phi[1:, parameters.COULOMB], (ratio**2).T @ phi[1:, parameters.VISCOUS]
+    coulomb = ratio.T @ phi[1:, parameters.COULOMB]
+    viscous = (ratio**2).T @ phi[1:, parameters.VISCOUS]
     return [
         JointParameters(
             name=name,

@@ -64,7 +64,8 @@ def print_tables(*tables: Table) -> None:
 
 def terminal_width() -> int:
     """Columns to print in: those of the terminal, at most 100; a file or pipe gets 100, or as many as COLUMNS says."""
-    console, stated = terminal_console(), os.environ.get("COLUMNS", "").isdigit()
+    console = terminal_console()
+    stated = os.environ.get("COLUMNS", "").isdigit()
     return min(console.width, WIDTH) if console.is_terminal or stated else WIDTH
 
 
@@ -134,7 +135,8 @@ def _error_table(columns: Mapping[str, Comparison[Metrics]], of: str) -> Table:
 
 
 def _error_cell(metrics: Metrics, group: str) -> str:
-    rms, relative = metrics.rms_of(group), metrics.relative_of(group)
+    rms = metrics.rms_of(group)
+    relative = metrics.relative_of(group)
     if rms is None:
         return "-"
     return f"{rms:.4g}" + ("" if relative is None else f" ({100 * relative:.3g} %)")
@@ -144,7 +146,9 @@ def state_table(states: Sequence[Mapping[str, Any]]) -> Table:
     """Contact states with sample counts, rows per sample, and the rank of the base."""
 
     def row(state: Mapping[str, Any]) -> Sequence[str]:
-        rank, smallest, rows = state["base_rank"], state["base_singular_value"], str(state["rows"])
+        rank = state["base_rank"]
+        smallest = state["base_singular_value"]
+        rows = str(state["rows"])
         return (
             str(state["name"]),
             str(state["samples"]),
@@ -160,7 +164,8 @@ def state_table(states: Sequence[Mapping[str, Any]]) -> Table:
 
 def _rank_share_cell(state: Mapping[str, Any]) -> str:
     """Share of the samples with the base at full rank, and the least rank of the others."""
-    full, ranks = state["base_full_share"], state["base_rank_shares"]
+    full = state["base_full_share"]
+    ranks = state["base_rank_shares"]
     if full is None:
         return ""
     lowest = min(ranks, default=6)

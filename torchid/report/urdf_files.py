@@ -81,7 +81,8 @@ def share_with_links_beyond_welds(robot: Robot, phi: Array) -> tuple[Array, dict
         Parameters of the bodies without links beyond welds, (L, 12), and those of the latter that change, (10,), in
         their own frames.
     """
-    remaining, changed = phi.copy(), dict[str, Array]()
+    remaining = phi.copy()
+    changed = dict[str, Array]()
     for number in sorted({robot.links[name][0] for name in robot.links_beyond_welds}):
         whole = phi[number, parameters.INERTIAL]
         before = {name: x for name, x in robot.links_beyond_welds.items() if robot.links[name][0] == number}

@@ -199,7 +199,8 @@ def _sites(number: int) -> tuple[str, str]:
 
 def _hold(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, position: float) -> None:
     """Fix a joint of a URDF, whose anchor is its body's origin, at a position [rad or m]."""
-    body, axis = joint.parent, np.array(joint.axis) / np.linalg.norm(joint.axis)
+    body = joint.parent
+    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
     start = Rotation.from_quat(np.array(body.quat), scalar_first=True)
     if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
         body.pos = np.array(body.pos) + start.apply(position * axis)
@@ -213,7 +214,8 @@ def set_inertial(body: mujoco.MjsBody, values: Array) -> None:
     body.mass, body.inertia, body.fullinertia[:] = 0.0, np.zeros(3), np.nan  # none of the last, for MuJoCo
     if values[parameters.MASS]:
         body.mass, com, inertia = parameters.mass_com_inertia(values)
-        body.ipos, body.fullinertia = com, inertia[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]
+        body.ipos = com
+        body.fullinertia = inertia[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]
         body.iquat = [1.0, 0.0, 0.0, 0.0]
 
 
@@ -237,7 +239,8 @@ class Followers:
 
     def errors(self, model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, Array, Array]:
         """How far they are off: Jacobian (k, nv), errors (k,) [rad or m] and bias accelerations (k,), which are 0."""
-        J, rows = np.zeros((len(self.at), model.nv)), np.arange(len(self.at))
+        J = np.zeros((len(self.at), model.nv))
+        rows = np.arange(len(self.at))
         J[rows, self.rate] = 1.0
         J[rows, self.master_rate] = -self.ratio
         return J, data.qpos[self.at] - self.ratio * data.qpos[self.master_at] - self.offset, np.zeros(len(rows))
@@ -245,7 +248,9 @@ class Followers:
 
 def loop_errors(model: mujoco.MjModel, data: mujoco.MjData, loops: Sequence[Loop]) -> tuple[Array, Array, Array]:
     """How far loops are open: Jacobian (k, nv), error (k,) [m, rad] and bias acceleration (k,) of what closes them."""
-    jacobians, errors, biases = [np.zeros((0, model.nv))], [np.zeros(0)], [np.zeros(0)]
+    jacobians = [np.zeros((0, model.nv))]
+    errors = [np.zeros(0)]
+    biases = [np.zeros(0)]
     for number, loop in enumerate(loops):
         first, other = (_site_motion(model, data, name) for name in _sites(number))
         rows = list(loop.components)
@@ -264,7 +269,8 @@ def rotation_error(start: Array, end: Array) -> Array:
 def _site_motion(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> tuple[Array, Array, Array, Array]:
     """Position (3,), rotation to world (3, 3), Jacobian (6, nv) and bias acceleration (6,) of a site."""
     site = model.site(name).id
-    J, J_dot = np.zeros((6, model.nv)), np.zeros((6, model.nv))
+    J = np.zeros((6, model.nv))
+    J_dot = np.zeros((6, model.nv))
     mujoco.mj_jacSite(model, data, J[:3], J[3:], site)
     mujoco.mj_jacDot(model, data, J_dot[:3], J_dot[3:], data.site_xpos[site], int(model.site_bodyid[site]))
     return data.site_xpos[site].copy(), data.site_xmat[site].reshape(3, 3).copy(), J, J_dot @ data.qvel
@@ -297,10 +303,12 @@ class FootMotion:
 
         Its linear bias is that of v + omega x l with l fixed in the world, as the floor's next material point needs.
         """
-        J, bias = self.J.copy(), self.bias.copy()
+        J = self.J.copy()
+        bias = self.bias.copy()
         J[:3] += radius * np.cross([0.0, 0.0, 1.0], self.J[3:], axisb=0, axisc=0)
         bias[:3] += radius * np.cross([0.0, 0.0, 1.0], self.bias[3:])
-        linear, angular = self.velocity[:3], self.velocity[3:]
+        linear = self.velocity[:3]
+        angular = self.velocity[3:]
         velocity = np.append(linear + radius * np.cross([0.0, 0.0, 1.0], angular), angular)
         return FootMotion(self.position, self.rotation, velocity, J, bias)
 
@@ -334,7 +342,8 @@ class Plant:
             UrdfError: MuJoCo does not take it, or it has springs.
             ConfigError: see `weld_positions` and `passive_joints`.
         """
-        stated, joints = stated or ConstrainedRobot(), read_urdf(urdf)[1]
+        stated = stated or ConstrainedRobot()
+        joints = read_urdf(urdf)[1]
         loops = (*(loop.loop for loop in stated.loops), *loops_of_file(urdf))
         self._constraints = JointConstraints.of(urdf, joints, loops, weld_positions(urdf, joints, stated.weld))
         self.model = compile_model(urdf, feet, physics_hz, constraints=self._constraints)
@@ -344,7 +353,8 @@ class Plant:
             _add_armatures(model, urdf, joints)
         if friction is not None:
             model.dof_frictionloss[6:], model.dof_damping[6:] = friction
-        self.nv, self.n = model.nv, model.nv - 6
+        self.nv = model.nv
+        self.n = model.nv - 6
         self.joint_names = tuple(model.joint(i).name for i in range(1, model.njnt))
         self.mass = float(model.body_subtreemass[1])
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # it integrates another acceleration than qacc
@@ -456,8 +466,12 @@ class Plant:
 
     def foot(self, index: int) -> FootMotion:
         """Where a foot is and how it moves."""
-        model, data, body, site = self.model, self.data, self._bodies[index], self._middles[index]
-        J, J_dot = np.zeros((6, self.nv)), np.zeros((6, self.nv))
+        model = self.model
+        data = self.data
+        body = self._bodies[index]
+        site = self._middles[index]
+        J = np.zeros((6, self.nv))
+        J_dot = np.zeros((6, self.nv))
         mujoco.mj_jacSite(model, data, J[:3], J[3:], site)
         mujoco.mj_jacDot(model, data, J_dot[:3], J_dot[3:], data.site_xpos[site], body)
         rotation = data.site_xmat[site].reshape(3, 3)
@@ -494,7 +508,8 @@ def compile_model(
     spec.option.timestep = 1.0 / physics_hz
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = _SLIP_RATIO
-    spec.option.tolerance, spec.option.iterations = 1e-15, 100
+    spec.option.tolerance = 1e-15
+    spec.option.iterations = 100
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=_FRICTION, solref=_SPRING)
     for foot in feet:
         _add_foot(spec, foot)
@@ -503,7 +518,8 @@ def compile_model(
     except ValueError as error:
         raise _refusal(urdf, spec, str(error)) from error
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT  # a stop's force would be in no sensor
-    model.dof_solref[:], model.dof_solimp[:, :2] = _STICTION, (0.99, 0.999)
+    model.dof_solref[:] = _STICTION
+    model.dof_solimp[:, :2] = (0.99, 0.999)
     return model
 
 
@@ -542,7 +558,8 @@ def _lumped_inertials(urdf: Path) -> dict[str, Array]:
     fixed = {joint.child: joint for joint in joints if joint.type == "fixed"}
     out = {link.name: np.zeros(parameters.INERTIAL.stop) for link in links}
     for link in links:
-        carrier, T = link.name, np.eye(4)
+        carrier = link.name
+        T = np.eye(4)
         while carrier in fixed:
             carrier, T = fixed[carrier].parent, joint_origin(fixed[carrier]) @ T
         out[carrier] += link_parameters(link, T)[parameters.INERTIAL]

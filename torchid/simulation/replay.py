@@ -61,7 +61,8 @@ class ReplayedLog:
             raise LogError(self.source, "time", f"windows of {length:g} s", accepted)
         gaps = np.cumsum(np.diff(self.time, prepend=self.time[0]) > _LONGEST_GAP * interval)
         stands = np.full(len(self.time), self.angular_velocity is None) | self.active.any(axis=1)
-        spans, begin = list[tuple[int, int]](), 0
+        spans = list[tuple[int, int]]()
+        begin = 0
         while begin < len(self.time) - 1:
             end = int(np.searchsorted(self.time, self.time[begin] + length - 0.5 * interval))
             if end >= len(self.time):
@@ -159,7 +160,8 @@ def replay_log(
     robot.add_gains(kp, kd)
     driving = log.torque + kp * log.position + kd * log.velocity
     steps = np.arange(round(times[-1] * _PHYSICS_HZ)) / _PHYSICS_HZ
-    joints, tilts = [], []
+    joints = []
+    tilts = []
     for begin, _ in windows:
         starts = float(log.time[begin])
         torque = _interpolated(starts + steps + 0.5 / _PHYSICS_HZ, log.time, driving) - model.offset
@@ -183,7 +185,8 @@ class _Simulated:
             if value < 0.0:
                 found = f"{value:.3g} kg m^2, which MuJoCo would not take"
                 raise InputError(model.urdf.parent, f"armature of {name}", found, "estimator.name=consistent")
-        self.log, self.floating = log, log.angular_velocity is not None
+        self.log = log
+        self.floating = log.angular_velocity is not None
         self.feet = feet if self.floating else ()
         self.model = compile_model(model.urdf, self.feet, _PHYSICS_HZ, self.floating, model.constraints)
         self.model.opt.gravity = GRAVITY_WORLD
@@ -195,7 +198,8 @@ class _Simulated:
         self.model.dof_armature[self.rate] += model.armature
         self.model.jnt_stiffness[[joint.id for joint in joints]] = model.stiffness
         self.model.qpos_spring[self.at] = 0.0
-        self.dry, self.stribeck = self.model.dof_frictionloss[self.rate].copy(), model.stribeck
+        self.dry = self.model.dof_frictionloss[self.rate].copy()
+        self.stribeck = model.stribeck
         self.stribeck_velocity = model.stribeck_velocity
         self.followers = Followers(self.model, model.constraints.mimics)
 
@@ -214,7 +218,8 @@ class _Simulated:
             begin: index of the sample.
             torque: (S, n), of the joints at every step.
         """
-        model, data = self.model, self.data
+        model = self.model
+        data = self.data
         self._place(begin)
         if self.stribeck.any():
             path = np.array([data.qpos, *(self._step(forces) for forces in torque)])
@@ -240,9 +245,12 @@ class _Simulated:
 
     def _place(self, begin: int) -> None:
         """Put the robot into the state of a sample."""
-        model, data, log = self.model, self.data, self.log
+        model = self.model
+        data = self.data
+        log = self.log
         mujoco.mj_resetData(model, data)
-        data.qpos[self.at], data.qvel[self.rate] = log.position[begin], log.velocity[begin]
+        data.qpos[self.at] = log.position[begin]
+        data.qvel[self.rate] = log.velocity[begin]
         self.followers.place(data)
         if log.angular_velocity is not None and log.quat_xyzw is not None:
             data.qpos[3:7] = log.quat_xyzw[begin][[3, 0, 1, 2]]
@@ -250,12 +258,14 @@ class _Simulated:
             mujoco.mj_fwdPosition(model, data)
             standing = [foot for foot, on in zip(self.feet, log.active[begin], strict=True) if on]
             low, still = zip(*(self._contact(foot) for foot in standing), strict=True)
-            data.qpos[2], data.qvel[:3] = -min(low), -np.mean(still, axis=0)
+            data.qpos[2] = -min(low)
+            data.qvel[:3] = -np.mean(still, axis=0)
 
     def _contact(self, foot: Foot) -> tuple[float, Array]:
         """Height of a foot's lowest point [m], and the velocity (3,) of the material there [m/s]."""
         site = self.model.site(foot_site(foot)).id
-        rotation, origin = self.data.site_xmat[site].reshape(3, 3), self.data.site_xpos[site]
+        rotation = self.data.site_xmat[site].reshape(3, 3)
+        origin = self.data.site_xpos[site]
         points = origin + np.array(foot.points) @ rotation.T
         lowest = int(np.argmin(points[:, 2] - foot.radii))
         J = np.zeros((3, self.model.nv))

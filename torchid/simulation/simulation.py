@@ -100,7 +100,8 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
 
 def _tasks(plant: Plant, feet: Sequence[Foot], targets: Array, rotations: Array) -> tuple[Array, Array]:
     """What should be zero: Jacobian (rows, nv), and how far off it is (rows,) [m, rad]."""
-    jacobians, off = [], []
+    jacobians = []
+    off = []
     for i, (foot, target, R) in enumerate(zip(feet, targets, rotations, strict=True)):
         now = plant.foot(i)
         jacobians.append(now.J[: foot.constrained])
@@ -166,7 +167,8 @@ class Controller:
     def torque(self, setpoint: Setpoint) -> Array:
         """Torques (n,) [N m] for the plant as last observed."""
         plant = self._plant
-        M, bias = plant.inertia, plant.bias
+        M = plant.inertia
+        bias = plant.bias
         feet = [plant.foot(i) for i in range(len(self._feet))]
         acceleration = self._acceleration(setpoint, M, bias, feet)
         needed = M @ acceleration + bias
@@ -187,7 +189,8 @@ class Controller:
     def _acceleration(self, setpoint: Setpoint, M: Array, bias: Array, feet: list[FootMotion]) -> Array:
         """The generalized acceleration (nv,) that meets all tasks best, by weighted least squares."""
         plant = self._plant
-        velocity, nv = plant.velocity, plant.nv
+        velocity = plant.velocity
+        nv = plant.nv
         tasks: list[tuple[float, Array, Array]] = []
 
         com_J = M[:3] / plant.mass  # the base's linear rows are the momentum of everything
@@ -208,11 +211,13 @@ class Controller:
                     off[:3] = self._rolled_position(i, foot) - foot.position
                     foot = foot.rolling(radius)
                 off[2] = 0.0  # the floor gives way
-                weight, target = _STANDING, _CREEP * off - _FOOT_DAMPING * foot.velocity
+                weight = _STANDING
+                target = _CREEP * off - _FOOT_DAMPING * foot.velocity
             else:
                 self._landed[i] = None
                 rate = np.concatenate([v, np.zeros(3)]) - foot.velocity
-                weight, target = _SWING, _servo(off, rate, np.concatenate([a, np.zeros(3)]))
+                weight = _SWING
+                target = _servo(off, rate, np.concatenate([a, np.zeros(3)]))
             rows = slice(self._feet[i].constrained)
             tasks.append((weight, foot.J[rows], (target - foot.bias)[rows]))
 
@@ -242,14 +247,16 @@ class Controller:
 
         Points that would have to pull on the floor are dropped, as far as enough others remain.
         """
-        maps, shares = [], []
+        maps = []
+        shares = []
         for foot, share, motion in zip(self._feet, load, feet, strict=True):
             if share <= ALOFT:
                 continue
             for arm in foot.arms @ motion.rotation.T - [0.0, 0.0, foot.rolling_radius]:
                 maps.append(motion.J[:3] - _cross(arm) @ motion.J[3:])
                 shares.append(share)
-        J, S = np.vstack(maps), np.array(shares)
+        J = np.vstack(maps)
+        S = np.array(shares)
         at_base = J[:, :6].T
         for _ in range(_TRIES):
             weighted = at_base * np.repeat(S, 3)
@@ -360,7 +367,8 @@ class ReferenceMotion:
 
 def _steps(steps: StepsConfig | None, feet: Sequence[str], time: Array) -> tuple[Array, Array]:
     """Height (T, F) [m] and share of the load (T, F) of every foot, lifted in turn from time 0 on."""
-    height, load = np.zeros((len(time), len(feet))), np.ones((len(time), len(feet)))
+    height = np.zeros((len(time), len(feet)))
+    load = np.ones((len(time), len(feet)))
     if steps is None:
         return height, load
     for turn, frame in enumerate(steps.order):
@@ -431,7 +439,8 @@ class Simulation:
             UnknownNameError: it moves what the robot does not have.
             InputError: it is too short, or lifts feet that the robot cannot do without.
         """
-        plant, hz = self.plant, self.config.control_hz
+        plant = self.plant
+        hz = self.config.control_hz
         motion = ReferenceMotion(config, self.stance, plant.joint_names, plant.foot_frames, hz)
         for support in motion.supports:
             self.require_support(support, f"motions.{config.name}.steps")
@@ -480,7 +489,9 @@ def record(
     Raises:
         InputError: the robot falls.
     """
-    config, plant, stance = simulation.config, simulation.plant, simulation.stance
+    config = simulation.config
+    plant = simulation.plant
+    stance = simulation.stance
     controller = Controller(plant, simulation.feet, stance.rotations, config.friction.levels or (0.0, 0.0))
     plant.place(stance.position)
     frames: list[tuple[Array, ...]] = []
@@ -576,8 +587,11 @@ def _measure_stability(simulation: Simulation, recording: Recording) -> Stabilit
     Raises:
         InputError: a foot never bears that much.
     """
-    log, load = recording.log, simulation.config.sensors.contact_threshold
-    plant, stance, feet = simulation.plant, simulation.stance, simulation.feet
+    log = recording.log
+    load = simulation.config.sensors.contact_threshold
+    plant = simulation.plant
+    stance = simulation.stance
+    feet = simulation.feet
     wrench = _require_field(log, "contact_wrench_local")
     R = recording.rotations
     force, moment = ((R @ part[..., None])[..., 0] for part in (wrench[..., :3], wrench[..., 3:]))
@@ -617,7 +631,8 @@ def _slip(position: Array, standing: BoolArray) -> float:
 def _zmp_margin(position: Array, force: Array, moment: Array, stance: Stance, feet: tuple[Foot, ...]) -> float:
     """Least distance from the zero-moment point to the border of the support polygon, per set of feet on the floor."""
     arm = np.cross(position, force) + moment
-    total, turning = force.sum(axis=1), arm.sum(axis=1)
+    total = force.sum(axis=1)
+    turning = arm.sum(axis=1)
     aloft = total[:, 2] < 1.0
     zmp = np.stack([-turning[:, 1], turning[:, 0]], axis=1) / np.where(aloft, np.nan, total[:, 2])[:, None]
     corners = [
@@ -667,12 +682,14 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
         _require_field(truth, f) for f in ("joint_position", "base_position_world", "base_quat_xyzw")
     )
     if sensors.noise.enabled:
-        rng, noise = np.random.default_rng([seed, 1, zlib.crc32(name.encode())]), sensors.noise
+        rng = np.random.default_rng([seed, 1, zlib.crc32(name.encode())])
+        noise = sensors.noise
 
         def noisy(values: Array, deviation: float | Array) -> Array:
             return values + deviation * rng.normal(size=values.shape)
 
-        position, base = noisy(position, noise.joint_position), noisy(base, noise.base_position)
+        position = noisy(position, noise.joint_position)
+        base = noisy(base, noise.base_position)
         turns = Rotation.from_rotvec(noise.base_orientation * rng.normal(size=(len(truth), 3)))
         turn = (Rotation.from_quat(turn) * turns).as_quat()
         torque = noisy(torque, noise.joint_torque)
@@ -698,7 +715,8 @@ def _foot_readings(truth: Log) -> tuple[Array, BoolArray]:
 
     As wrenches all feet get the noise, bias and gain that they have whatever some of them read.
     """
-    wrench, force = _require_field(truth, "contact_wrench_local"), truth.contact_force_normal
+    wrench = _require_field(truth, "contact_wrench_local")
+    force = truth.contact_force_normal
     if force is None:
         return wrench, np.zeros(wrench.shape[1], dtype=bool)
     along: BoolArray = np.asarray(np.isfinite(force).any(axis=0))

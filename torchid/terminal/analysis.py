@@ -94,7 +94,8 @@ def _headline(scenarios: Sequence[ScenarioAnalysis]) -> str:
     """The verdict on the sensors, of scenarios of which the worst comes first."""
     if not scenarios:  # a process that only helps
         return ""
-    worst, several = scenarios[0], len(scenarios) > 1
+    worst = scenarios[0]
+    several = len(scenarios) > 1
     if not _judged_states(worst):
         return _stack_headline(worst)
     if lost := _lost(worst):  # planned sensors never lose it
@@ -103,7 +104,8 @@ def _headline(scenarios: Sequence[ScenarioAnalysis]) -> str:
             bad = f"{sum(_lost(scenario) > 0 for scenario in scenarios)} of {len(scenarios)} scenarios"
             where = f"{bad}, first of all in {where} of {worst.name}"
         return f"The sensors of the file do not suffice: the base is lost in {where}"
-    count, states = len(worst.plan.chosen), sum(len(scenario.states) for scenario in scenarios)
+    count = len(worst.plan.chosen)
+    states = sum(len(scenario.states) for scenario in scenarios)
     if worst.proposed is not None:
         sensors = "The sensors of the file suffice"
     elif several:
@@ -117,7 +119,8 @@ def _headline(scenarios: Sequence[ScenarioAnalysis]) -> str:
 
 def _stack_headline(scenario: ScenarioAnalysis) -> str:
     """What sensors determine that are judged by all samples together."""
-    plan, base = scenario.plan, scenario.base
+    plan = scenario.plan
+    base = scenario.base
     if scenario.proposed is not None:  # of a robot with a fixed base
         combinations = f"{base.rank} combinations of {int(base.free.sum())} parameters"
         return f"The sensors of the file determine at best {combinations}, all samples together"
@@ -128,9 +131,11 @@ def _stack_headline(scenario: ScenarioAnalysis) -> str:
 
 def _determined_text(scenario: ScenarioAnalysis) -> str:
     """How many parameters are known alone, how many in sums, and how many are unobservable."""
-    base, names = scenario.base, scenario.plan.problem.robot.body_names
+    base = scenario.base
+    names = scenario.plan.problem.robot.body_names
     alone = int((np.count_nonzero(base.combination, axis=1) == 1).sum())
-    seen, free = int(base.combination.any(axis=0).sum()), int(base.free.sum())
+    seen = int(base.combination.any(axis=0).sum())
+    free = int(base.free.sum())
     sums = f"{seen - alone} only in {format_count(base.rank - alone, 'sum')}"
     bodies = [line.partition(":")[0] for line in unobservable_parameters(base, names)]
     unobservable = f"{free - seen} unobservable{f' (of {join_names(bodies)})' if bodies else ''}"
@@ -206,7 +211,8 @@ def _accuracy_lines(sets: Mapping[str, SetAccuracy], room: int, width: int) -> l
 
 
 def _scenario_parts(scenario: ScenarioAnalysis, width: int) -> list[str | Table]:
-    plan, base = scenario.plan, scenario.base
+    plan = scenario.plan
+    base = scenario.base
     parts: list[str | Table] = [f"Scenario {scenario.name}", branch_table(plan)]
     parts += [sets_table(plan.parts)] if plan.parts else []
     proof = "no cheaper set exists" if plan.proven else "whether a cheaper set exists is not proven"

@@ -105,7 +105,8 @@ def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list
         return []
     most = room - 2  # heading, legend
     shown = sorted(_most_changed(robot, estimate, free)[: most if len(free) <= most else most - 1])
-    names, columns = [robot.body_names[k] for k in shown], _columns(robot, estimate, shown)
+    names = [robot.body_names[k] for k in shown]
+    columns = _columns(robot, estimate, shown)
     lines = column_lines(("body", names), columns, width)
     marks = {word for line in lines[1:] for word in line.split()[1:]}
     if len(free) > len(shown):
@@ -117,7 +118,8 @@ def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list
 
 def _most_changed(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[int]:
     """The bodies whose mass moved most, or else whose Coulomb friction did."""
-    phi, nominal = estimate.phi.reshape(-1, PER_BODY), robot.nominal
+    phi = estimate.phi.reshape(-1, PER_BODY)
+    nominal = robot.nominal
     moved = np.abs(phi - nominal)
     return sorted(bodies, key=lambda k: (-moved[k, _MASS], -moved[k, _COULOMB], k))
 
@@ -125,7 +127,8 @@ def _most_changed(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> li
 def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tuple[str, list[str]]]:
     """Headings and cells, the most important first."""
     phi, error = (x.reshape(-1, PER_BODY) for x in (estimate.phi, estimate.standard_error))
-    verdict, nominal = estimate.verdict.reshape(-1, PER_BODY), robot.nominal
+    verdict = estimate.verdict.reshape(-1, PER_BODY)
+    nominal = robot.nominal
 
     def cells(parameter: int) -> list[str]:
         if parameter != _MASS and set(verdict[:, parameter]) <= {FIXED, UNOBSERVABLE}:
@@ -180,7 +183,9 @@ _NAMED = 6  # conditions
 
 def detail_parts(run: Identification, width: int, last: Sequence[tuple[str, str]] = ()) -> list[str | Table]:
     """The verdict, all that needs attention, all tables, and the key figures one per line; as `answer_lines`."""
-    estimate, robot, said = run.estimate, run.experiment.robot, answer(run)
+    estimate = run.estimate
+    robot = run.experiment.robot
+    said = answer(run)
     parts: list[str | Table] = [*wrap_words(said.headline, width)]
     parts += [line for text in said.attention for line in labelled("attention", text, width)]
     if not run.misfit.explained:
@@ -213,7 +218,9 @@ def _misfit_text(misfit: Misfit) -> str:
 
 def _fit_texts(run: Identification) -> Iterator[tuple[str, str]]:
     """Key figures of the fit, with what they are about."""
-    estimate, robot, sensors = run.estimate, run.experiment.robot, run.experiment.sensors
+    estimate = run.estimate
+    robot = run.experiment.robot
+    sensors = run.experiment.sensors
     weighted = "" if sensors.task_weights is None else ", weighted by estimator.task_weights"
     yield "minimized", minimized_errors(robot, run.experiment.contacts, sensors) + weighted
     yield "parameters", f"{estimate.rank} independent combinations of {int(estimate.phi.size)} identified"
@@ -223,7 +230,8 @@ def _fit_texts(run: Identification) -> Iterator[tuple[str, str]]:
     if run.motion_noise.combinations:
         yield "motion noise", str(run.motion_noise)
     if run.validation is not None:
-        identified, nominal = run.validation.identified, run.validation.nominal
+        identified = run.validation.identified
+        nominal = run.validation.nominal
         texts = (describe_errors(group, identified.rms_of(group), nominal.rms_of(group)) for group in DECISIVE_GROUPS)
         blocks = f"each of {run.validation.folds} blocks, against {robot.format}"
         yield "held out", f"{blocks}: {'; '.join(filter(None, texts))}"
@@ -236,7 +244,8 @@ def _choice_texts(choices: Mapping[str, object]) -> Iterator[tuple[str, str]]:
 
 def _end_texts(run: Identification) -> Iterator[tuple[str, str]]:
     """How conditions of physical consistency are met and what they cost, the total mass, and the time of each step."""
-    estimate, robot = run.estimate, run.experiment.robot
+    estimate = run.estimate
+    robot = run.experiment.robot
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     yield "consistency", f"smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}"
     if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
@@ -342,7 +351,8 @@ _MOST_PARAMETERS = 5  # bodies and joints in the answer
 
 def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list[str]:
     """A sentence, and the ranges that are widest; lines of at most so many columns."""
-    fitted, table = drawn.fitted, table_of_draws(drawn.samples)
+    fitted = drawn.fitted
+    table = table_of_draws(drawn.samples)
     few = len(table) < _FEWEST_FOR_TAILS
     ends, titles = ((0.0, 0.5, 1.0), ("least", "median", "largest")) if few else (_ENDS, ("2.5 %", "median", "97.5 %"))
     total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), ends)

@@ -28,7 +28,8 @@ def simulation_lines(config: SimulationConfig, stabilities: Mapping[str, Stabili
     """
     lines = [*wrap_words(_headline(config, stabilities), width), ""]
     end = labelled("rolling", balls, width, _TEXT_LINES) if (balls := simulated_balls(config)) else []
-    nominal, kind = nominal_name(config), "URDF" if config.robot.mjcf is None else "MJCF"
+    nominal = nominal_name(config)
+    kind = "URDF" if config.robot.mjcf is None else "MJCF"
     text = f"logs/ and {nominal}; the truth: exact/ and the simulated {kind}"
     end += labelled("to identify", text, width, _TEXT_LINES)
     end.append(written_line(config.output))
@@ -58,7 +59,8 @@ def _motion_lines(config: SimulationConfig, stabilities: Mapping[str, Stability]
 
     def use(stability: Stability) -> float:
         """The largest share of a bound that is used up."""
-        bounds, margin = config.bounds, stability.zmp_margin
+        bounds = config.bounds
+        margin = stability.zmp_margin
         near = bounds.zmp_m / margin if margin > 0.0 else 1.0
         return max(stability.slip / bounds.slip_m, stability.height_change / bounds.height_m, stability.effort, near)
 
@@ -91,7 +93,8 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
         verbose: with all joints.
     """
     lines = wrap_words(_drift(replayed), width, "  ")
-    names, columns = list[str](), [(f"{share * replayed.window:g} s", list[str]()) for share in _SHARES]
+    names = list[str]()
+    columns = [(f"{share * replayed.window:g} s", list[str]()) for share in _SHARES]
     for name in replayed.at(replayed.window):
         drawn = [f"{len(replayed.sampled)} samples"] if replayed.sampled else []
         names += [f"{name}, {who}" for who in (replayed.of, "identified", *drawn)]
