@@ -34,7 +34,7 @@ def files(folder: Path, deviation: float) -> tuple[Path, dict[tuple[str, str], f
     if deviation:
         oracle.perturb(rng, deviation)
     contacts = [(contact.frame, len(contact.components)) for contact in CONTACTS]
-    logs = [make_log(oracle, contacts, STATES, 40, rng, f"{name}.npz") for name in ("first", "second", "new")]
+    logs = [make_log(oracle, contacts, STATES, 80, rng, f"{name}.npz") for name in ("first", "second", "new")]
     ideal = [
         Miscalibration(*(np.full(shape, x) for shape in ((robot.n,), (3, 6), (len(SENSORS), 6)) for x in (0.0, 1.0)))
     ] * 3

@@ -80,15 +80,6 @@ def test_a_fit_without_the_pose_of_the_base_predicts_as_well_as_with_it(written:
     assert again == pytest.approx(derived, rel=1e-12)
 
 
-def test_the_checks_find_reversed_torques_without_the_base(written: Written) -> None:
-    def reversed_torque(log: Log) -> Log:
-        return replace(log, **NO_BASE, joint_torque=-value(log.joint_torque))
-
-    checked = check_experiment(written(reversed_torque, base_motion="contacts"))[0]
-    assert not checked.usable
-    assert any(finding.field == "joint_torque" for finding in checked.findings)
-
-
 # ---------------------------------------------------------------------------------------------------- detected contacts
 
 
