@@ -46,10 +46,10 @@ def test_a_run_finds_the_delay_of_a_pd_law_and_an_evaluation_predicts_with_it(
     shown = " ".join(capsys.readouterr().out.split())
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     choice = metrics["delay_selection"]
-    assert choice["found"] == pytest.approx(DELAY, abs=2e-5)
+    assert choice["best"] == pytest.approx(DELAY, abs=2e-5)
     assert choice["interval"][0] < DELAY < choice["interval"][1]
-    assert "delay 3.7 ± " in shown
-    assert load_config(tmp_path / "run" / "config.yaml").actuators.delay == choice["delay"]
+    assert "delay 3.7 ms (95 %: " in shown
+    assert load_config(tmp_path / "run" / "config.yaml").actuators.delay == choice["value"]
     assert main(["evaluate", str(tmp_path / "run"), "--log", str(tmp_path / "new.npz")]) == 0
     (written,) = (tmp_path / "run" / "evaluation").rglob("metrics.json")
     with_delay = json.loads(written.read_text())["new"]["identified"]["joint_torque_rms"]

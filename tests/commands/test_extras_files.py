@@ -147,7 +147,7 @@ def test_the_width_of_the_sign_is_found_where_friction_does_not_reverse_at_once(
     setup = set_up(load_config(run.file, ["actuators.sign_width=auto"]))
     choice = with_chosen_settings(setup, Progress(disable=True))[1].sign_width
     assert choice is not None
-    assert choice.width == pytest.approx(WIDTH, rel=2e-3)
+    assert choice.value == pytest.approx(WIDTH, rel=2e-3)
 
 
 def test_a_urdf_that_is_right_has_no_errors_whatever_the_offsets(tmp_path: Path) -> None:

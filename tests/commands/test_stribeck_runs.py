@@ -60,9 +60,9 @@ def test_a_run_finds_it_beside_a_delay_and_an_evaluation_predicts_with_it(folder
     metrics = json.loads((run / "metrics.json").read_text())
     choice = metrics["stribeck_selection"]
     assert choice["interval"][0] < VELOCITY < choice["interval"][1]
-    assert choice["velocity"] == pytest.approx(VELOCITY, rel=0.1)
-    assert metrics["delay_selection"]["delay"] == pytest.approx(DELAY, abs=2e-4)
-    assert load_config(run / "config.yaml").actuators.stribeck == choice["velocity"]
+    assert choice["value"] == pytest.approx(VELOCITY, rel=0.1)
+    assert metrics["delay_selection"]["value"] == pytest.approx(DELAY, abs=2e-4)
+    assert load_config(run / "config.yaml").actuators.stribeck == choice["value"]
     extras = json.loads((run / "parameters.json").read_text())["extras"]
     assert [x["value"] for x in extras if x["what"] == "stribeck"] == pytest.approx(AT_REST, rel=0.1)
 

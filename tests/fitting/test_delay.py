@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from motions import value
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.fit import LogFitter
-from torchid.fitting.separable import EARLIEST_DELAY, LATEST_DELAY, DelayChoice, choose_delay
+from torchid.fitting.profile import EARLIEST_DELAY, LATEST_DELAY, Profile, choose_delay
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.logs.segments import with_delayed_torques
@@ -24,22 +22,12 @@ from torchid.sensing import SensorNoise, named_sensors
 
 def chosen(
     *logs: Log, estimator: LeastSquares | Consistent | None = None, terms: ExtraTerms | None = None, std: float = NOISE
-) -> DelayChoice:
+) -> Profile:
     """What is found in logs of the arm."""
-    return looked_for(choose_delay, *logs, estimator=estimator, terms=terms, std=std)
-
-
-def looked_for(
-    look: Callable[..., Any],
-    *logs: Log,
-    estimator: LeastSquares | Consistent | None = None,
-    terms: ExtraTerms | None = None,
-    std: float = NOISE,
-) -> Any:
     robot, terms = arm()[0], terms or ExtraTerms()
     builder = RowBuilder(robot, (), named_sensors("joints", robot.n, 0, SensorNoise(joint_torque=std)), terms)
     fitter = LogFitter(robot=robot, builder=builder, estimator=estimator or LeastSquares())
-    return look([bind_log(log, robot, ()) for log in logs], fitter, terms)
+    return choose_delay([bind_log(log, robot, ()) for log in logs], fitter, terms)
 
 
 @pytest.mark.parametrize("delay", [DELAY, -0.0042, 0.0231, 0.05])
@@ -50,10 +38,10 @@ def test_a_delay_of_a_part_of_a_step_is_found_to_a_microsecond(
     delay: float, estimator: LeastSquares | Consistent
 ) -> None:
     found = chosen(recorded(delay), estimator=estimator)
-    assert found.found == pytest.approx(delay, abs=1e-6)
-    assert found.delay == pytest.approx(delay, abs=1e-6)
-    assert found.residual < 1e-2 * found.undelayed_residual
-    assert f"{1e3 * delay:.3g} ±" in str(found)
+    assert found.best == pytest.approx(delay, abs=1e-6)
+    assert found.value == pytest.approx(delay, abs=1e-6)
+    assert found.share < 1e-2
+    assert str(found).startswith(f"{1e3 * delay:.3g} ms (95 %: ")
 
 
 def test_it_is_found_beside_armatures_springs_offsets_and_scales() -> None:
@@ -67,7 +55,7 @@ def test_it_is_found_beside_armatures_springs_offsets_and_scales() -> None:
     torque = value(log.joint_torque) + 0.05 * a + 0.3 * q
     torque = (torque + np.array([0.4, -0.2])) / np.array([1.0, 1.3])
     found = chosen(replace(log, joint_torque=torque), terms=terms)
-    assert found.found == pytest.approx(DELAY, abs=2e-6)
+    assert found.best == pytest.approx(DELAY, abs=2e-6)
 
 
 @pytest.mark.parametrize(
@@ -78,20 +66,20 @@ def test_intervals_of_95_percent_hold_the_delay_of_noisy_logs(estimator: LeastSq
     found = [chosen(log, estimator=estimator) for log in logs]
     held = sum(one.interval[0] <= DELAY <= one.interval[1] for one in found)
     assert held >= 35  # of 40; 38 expected, fewer than 35 of every 21st draw
-    scatter = np.std([one.found for one in found])
-    assert 0.8 < np.median([one.standard_error for one in found]) / scatter < 1.4
-    assert np.mean([one.found for one in found]) == pytest.approx(DELAY, abs=0.4 * scatter)
+    scatter = np.std([one.best for one in found])
+    assert 0.8 < np.median([(one.interval[1] - one.best) / 1.96 for one in found]) / scatter < 1.4
+    assert np.mean([one.best for one in found]) == pytest.approx(DELAY, abs=0.4 * scatter)
 
 
 def test_no_delay_is_none_and_one_that_a_single_sine_cannot_tell_is_named() -> None:
     """A sine of one rate fits any delay with some inertia and damping."""
     none = chosen(preprocess(recorded(0.0, NOISE, seed=5), cutoff_hz=15.0))
-    assert none.delay == 0.0
-    assert abs(none.found) < 1e-3
+    assert none.value == 0.0
+    assert abs(none.best) < 1e-3
     assert "does not differ significantly from none" in str(none)
     log = preprocess(recorded(DELAY, 1e-3, shape=(1, 0.02)), cutoff_hz=15.0)
     single = chosen(log, terms=ExtraTerms(armature=True, stiffness=True), std=1e-3)
-    assert single.delay == 0.0
+    assert single.value == 0.0
     assert single.confounded_with
     assert "confounded with" in str(single)
 
@@ -134,5 +122,5 @@ def test_a_delay_beyond_those_that_are_tried_is_said_to_be_at_their_end(beyond: 
     end = min(max(beyond, EARLIEST_DELAY), LATEST_DELAY)
     with pytest.warns(TorchidWarning, match=f"{end:g} s or beyond; are torques and positions stamped by the same"):
         found = chosen(recorded(beyond))
-    assert found.found == end
+    assert found.best == end
     assert "an end of what is tried: the best may lie beyond" in str(found)

@@ -32,7 +32,7 @@ def test_an_arm_that_can_exist_is_predicted_to_two_percent_on_a_run_that_no_fit_
     assert metrics["test"]["base_force_rms"] is None
     assert metrics["violations"] == []
     assert_loads(tmp_path / "kuka" / "identified.urdf", sum(one["identified"]["m"] for one in parameters["bodies"]))
-    x, y = np.rad2deg(metrics["base_tilt_selection"]["tilt"])
+    x, y = np.rad2deg(metrics["base_tilt_selection"]["value"])
     assert -2.5 < x < -1.3, "the table is not level, whatever else is fitted"
     assert abs(y) < 0.8
     offsets = {x["name"]: x for x in parameters["extras"] if x["what"] == "offset"}

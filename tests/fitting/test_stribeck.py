@@ -12,7 +12,7 @@ from stribeck import AT_REST, NOISE, recorded
 
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.fit import LogFitter
-from torchid.fitting.separable import StribeckChoice, choose_stribeck
+from torchid.fitting.profile import Profile, choose_stribeck
 from torchid.logs import Log
 from torchid.logs.dry_friction import mean_stribeck
 from torchid.logs.preprocess import preprocess
@@ -32,7 +32,7 @@ def chosen(
     cutoff_hz: float | None = None,
     terms: ExtraTerms | None = None,
     estimator: LeastSquares | Consistent | None = None,
-) -> StribeckChoice:
+) -> Profile:
     terms = terms or ExtraTerms()
 
     def logs_and_fitter(velocity: float | None) -> tuple[Sequence[Samples], LogFitter]:
@@ -61,19 +61,19 @@ def test_friction_at_rest_is_found_beside_friction_that_differs_by_direction(
 @pytest.mark.parametrize("velocity", [0.03, 0.13, 0.5])
 def test_the_velocity_of_exact_torques_is_found(velocity: float) -> None:
     found = chosen(recorded(velocity))
-    assert found.found == pytest.approx(velocity, rel=1e-3)
-    assert found.velocity == pytest.approx(velocity, rel=1e-3)
-    assert found.residual < 1e-2 * found.coulomb_residual
-    assert f"{found.velocity:.3g} rad/s (m/s) (95 %: " in str(found)
+    assert found.best == pytest.approx(velocity, rel=1e-3)
+    assert found.value == pytest.approx(velocity, rel=1e-3)
+    assert found.share < 1e-2
+    assert f"{found.value:.3g} rad/s (m/s) (95 %: " in str(found)
 
 
 def _held(count: int, cutoff_hz: float | None) -> tuple[int, float]:
     """How many of so many intervals hold the velocity, and the median standard error over the scatter."""
     found = [chosen(recorded(0.2, NOISE, seed), cutoff_hz) for seed in range(count)]
-    spans = [one.interval for one in found if one.velocity is not None and one.interval is not None]
+    spans = [one.interval for one in found if one.value is not None and one.interval is not None]
     assert len(spans) == count
     errors = np.log([high / low for low, high in spans]) / (2.0 * 1.96)
-    scatter = np.std(np.log([one.found for one in found]))
+    scatter = np.std(np.log([one.best for one in found]))
     return sum(low <= 0.2 <= high for low, high in spans), float(np.median(errors) / scatter)
 
 
@@ -85,7 +85,7 @@ def test_intervals_hold_the_velocity_of_noisy_logs() -> None:
 @pytest.mark.parametrize("estimator", [LeastSquares(), Consistent()], ids=["plain", "consistent"])
 def test_coulomb_friction_alone_has_no_velocity(estimator: LeastSquares | Consistent) -> None:
     found = chosen(recorded(0.1, NOISE, at_rest=np.zeros(2)), 10.0, estimator=estimator)
-    assert found.velocity is None
+    assert found.value is None
     assert str(found).startswith("none: friction at rest is not significantly beyond Coulomb friction")
 
 

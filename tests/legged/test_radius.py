@@ -45,10 +45,10 @@ def test_the_radius_of_feet_is_found_where_they_are_balls(tmp_path: Path) -> Non
     write_log(record(exact, true.robot.base_link, Noise(), np.random.default_rng(0)), tmp_path / "log.npz")
     setup, choices = with_chosen_settings(set_up(load_config(experiment(tmp_path))), Progress(disable=True))
     assert choices.radius is not None
-    assert choices.radius.radius == pytest.approx(RADIUS_M, abs=2e-3)
-    assert {contact.radius for contact in setup.contacts} == {choices.radius.radius}
-    assert {contact.radius for contact in setup.config.contacts} == {choices.radius.radius}
-    assert f"ball of radius {1e3 * choices.radius.radius:.3g} mm, by the logs" in setup.rolling
+    assert choices.radius.value == pytest.approx(RADIUS_M, abs=2e-3)
+    assert {contact.radius for contact in setup.contacts} == {choices.radius.value}
+    assert {contact.radius for contact in setup.config.contacts} == {choices.radius.value}
+    assert f"ball of radius {1e3 * choices.radius.value:.3g} mm, by the logs" in setup.rolling
     model = row_model(setup, setup.builder(setup.sensors))  # what a file of factors keeps of it
     again = with_choices_of(model, set_up(load_config(experiment(tmp_path))))
     assert again.contacts == setup.contacts
@@ -64,5 +64,5 @@ def test_a_log_that_does_not_say_where_the_ground_is_keeps_points(tmp_path: Path
     write_log(replace(log, base_quat_xyzw=None, contact_wrench_world=None), tmp_path / "log.npz")
     setup, choices = with_chosen_settings(set_up(load_config(experiment(tmp_path))), Progress(disable=True))
     assert choices.radius is not None
-    assert choices.radius.radius is None
+    assert choices.radius.value is None
     assert {contact.radius for contact in setup.contacts} == {0.0}

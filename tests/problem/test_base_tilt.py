@@ -17,7 +17,7 @@ from welded import CONTACTS, SENSORS, STATES
 
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
-from torchid.fitting.separable import LARGEST_TILT, choose_base_tilt
+from torchid.fitting.profile import LARGEST_TILT, choose_base_tilt
 from torchid.logs import Log
 from torchid.problem import RowBuilder, bind_log
 from torchid.robot import Robot
@@ -89,10 +89,11 @@ def fitter_of(robot: Robot, sensors: str) -> LogFitter:
 def test_the_tilt_is_found_and_the_true_robot_leaves_nothing(sensors: str) -> None:
     robot, _, log = skew_machine()
     choice = choose_base_tilt([bind_log(recorded_askew(log), robot, CONTACTS)], fitter_of(robot, sensors))
-    np.testing.assert_allclose(choice.tilt, TILT, rtol=0.0, atol=1e-4)
-    assert choice.residual < 1e-2 * choice.level_residual
+    np.testing.assert_allclose(choice.value, TILT, rtol=0.0, atol=1e-4)
+    assert choice.share is not None
+    assert choice.share < 1e-2
     level = choose_base_tilt([bind_log(log, robot, CONTACTS)], fitter_of(robot, sensors))
-    np.testing.assert_allclose(level.tilt, 0.0, rtol=0.0, atol=1e-4)
+    np.testing.assert_allclose(level.value, 0.0, rtol=0.0, atol=1e-4)
 
 
 def test_the_base_of_another_frame_is_no_tilt() -> None:
@@ -102,4 +103,4 @@ def test_the_base_of_another_frame_is_no_tilt() -> None:
     samples = bind_log(replace(log, base_quat_xyzw=quat), robot, CONTACTS)
     with pytest.warns(match="is the base's orientation that of another frame"):
         choice = choose_base_tilt([samples], fitter_of(robot, "full"))
-    assert max(np.abs(choice.tilt)) == LARGEST_TILT
+    assert max(np.abs(choice.value)) == LARGEST_TILT

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -23,24 +22,21 @@ from torchid.fitting.experiment import Experiment, RobotSetup, S, with_radius
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.left_out import (
     TERMS,
-    Evidence,
     Reading,
     TermsChoice,
     block_edges,
     choose_terms,
     compress_reading,
     thinned,
-    widest,
     with_terms,
 )
 from torchid.fitting.noise import force_gain, recorded_sensors
-from torchid.fitting.separable import (
-    DelayChoice,
-    SignWidthChoice,
-    StribeckChoice,
-    TiltChoice,
+from torchid.fitting.profile import (
+    Profile,
     choose_base_tilt,
+    choose_data,
     choose_delay,
+    choose_radius,
     choose_sign_width,
     choose_stribeck,
 )
@@ -59,6 +55,15 @@ from torchid.settings import AUTO
 
 Chosen = TypeVar("Chosen")
 
+MARGINS = (None, 0.03, 0.06)
+"""Times around changes of contact without which fits are tried [s]."""
+
+MOST_TRIED = 20_000
+"""Samples of a log that settings are chosen with."""
+
+_OCTAVES, _LOWEST_HZ = 8, 2.5  # of cutoffs that are tried, and the lowest: nobody moves slower to be identified
+_PERIODS = 12.0 * DROPPED_PERIODS  # of a cutoff in the shortest log, at least: of a fourth held back a third is left
+
 
 @dataclass(frozen=True)
 class SampleRates:
@@ -76,14 +81,14 @@ class Choices:
     """How settings were chosen, in the order in which they are; None for what the experiment states."""
 
     cutoff: CutoffChoice | None = None
-    radius: RadiusChoice | None = None
-    contact_margin: DataChoice | None = None
-    stiction: DataChoice | None = None
-    base_tilt: TiltChoice | None = None
-    sign_width: SignWidthChoice | None = None
+    radius: Profile | None = None
+    contact_margin: Profile | None = None
+    stiction: Profile | None = None
+    base_tilt: Profile | None = None
+    sign_width: Profile | None = None
     terms: TermsChoice | None = None
-    delay: DelayChoice | None = None
-    stribeck: StribeckChoice | None = None
+    delay: Profile | None = None
+    stribeck: Profile | None = None
     sample_rate: SampleRates | None = None
 
     @property
@@ -97,10 +102,10 @@ class Choices:
         named = [] if self.terms is None else [str(self.terms)]
         if self.stiction is not None and self.stiction.value:
             named.append("samples at rest left out")
-        if self.sign_width is not None and self.sign_width.width is not None:
-            named.append(f"Coulomb friction over {self.sign_width.width:.2g} rad/s")
-        if self.delay is not None and self.delay.delay:
-            named.append(f"torques {1e3 * self.delay.delay:.3g} ms late")
+        if self.sign_width is not None and self.sign_width.value is not None:
+            named.append(f"Coulomb friction over {self.sign_width.value:.2g} rad/s")
+        if self.delay is not None and self.delay.value:
+            named.append(f"torques {1e3 * self.delay.value:.3g} ms late")
         return "; ".join(one for one in named if one != "none")
 
     def by_name(self) -> dict[str, object]:
@@ -134,32 +139,37 @@ def _with_chosen_data(setup: S, choices: Choices, trials: _Trials, bars: Progres
         setup = _with_preprocessing(setup, cutoff_hz=choices.cutoff.cutoff_hz)
     if setup.open_radii:
         choices.radius = _chosen("radius of feet", partial(_radius, setup, trials), bars)
-        setup = setup if choices.radius.radius is None else with_radius(setup, choices.radius.radius)
+        setup = setup if choices.radius.value is None else with_radius(setup, choices.radius.value)
     actuators = setup.config.actuators
     if actuators.stiction == AUTO and actuators.stribeck is None and trials.measures_torques(setup):
         rest = {value: _with_actuators(setup, stiction=value) for value in (False, True)}
-        choices.stiction = _chosen("samples at rest", partial(_narrowest_needed, trials, rest), bars)
+        choices.stiction = _chosen("samples at rest", partial(_data, rest, trials), bars)
         setup = _with_actuators(setup, stiction=bool(choices.stiction.value))
     if setup.config.preprocessing.contact_margin_s == AUTO:
         margins = {margin: _with_preprocessing(setup, contact_margin_s=margin) for margin in MARGINS}
-        choices.contact_margin = _chosen("margin of contacts", partial(_narrowest_needed, trials, margins), bars)
+        choices.contact_margin = _chosen("margin of contacts", partial(_data, margins, trials), bars)
         setup = _with_preprocessing(setup, contact_margin_s=choices.contact_margin.value)
     if finds_cutoff and choices.cutoff is not None and choices.cutoff.cutoff_hz is not None:
         choices.cutoff = _chosen("cutoff", partial(_cutoff, setup, trials, choices.cutoff, shortest), bars)
         setup = _with_preprocessing(setup, cutoff_hz=choices.cutoff.cutoff_hz)
     if setup.config.robot.base_tilt == AUTO:
-        choices.base_tilt = tilt = _chosen("base tilt", lambda: choose_base_tilt(*trials.whole(setup)), bars)
-        stated = replace(setup.config.robot, base_tilt=tilt.tilt)
-        robot = replace(setup.robot, base_tilt=tilt.tilt)
-        setup = replace(setup, robot=robot, config=replace(setup.config, robot=stated))
+        choices.base_tilt = _chosen("base tilt", lambda: choose_base_tilt(*trials.whole(setup)), bars)
+        tilt = choices.base_tilt.value
+        config = replace(setup.config, robot=replace(setup.config.robot, base_tilt=tilt))
+        setup = replace(setup, robot=replace(setup.robot, base_tilt=tilt), config=config)
     return setup
 
 
 def _with_chosen_terms(setup: S, choices: Choices, trials: _Trials, bars: Progress) -> S:
     """The setup with the terms of actuators that are fitted, and their numbers."""
     if setup.config.actuators.sign_width == AUTO and setup.config.estimator.friction and trials.measures_torques(setup):
-        choices.sign_width = _chosen("sign width", partial(_sign_width, setup, trials), bars)
-        setup = _with_actuators(setup, sign_width=choices.sign_width.width)
+        widths = partial(_with_actuators, setup)
+        choices.sign_width = _chosen(
+            "sign width",
+            lambda: choose_sign_width(lambda width: trials.reading(widths(sign_width=width)), trials.kinds(setup)),
+            bars,
+        )
+        setup = _with_actuators(setup, sign_width=choices.sign_width.value)
     if candidates := trials.candidates(setup):
         choices.terms = _chosen("terms of actuators", partial(trials.choose_terms, setup), bars)
         adopted = choices.terms.adopted
@@ -167,64 +177,22 @@ def _with_chosen_terms(setup: S, choices: Choices, trials: _Trials, bars: Progre
         if "delay" in adopted:
             choices.delay = _chosen("delay of torques", lambda: choose_delay(*trials.whole(setup), setup.terms), bars)
     if setup.config.actuators.delay == AUTO:
-        setup = _with_actuators(setup, delay=choices.delay.delay if choices.delay else 0.0)
+        setup = _with_actuators(setup, delay=choices.delay.value if choices.delay else 0.0)
     if setup.config.actuators.stribeck == AUTO:
         trial = partial(trials.whole, setup)
         choices.stribeck = _chosen(
             "Stribeck velocity", lambda: choose_stribeck(lambda v: trial(stribeck=v), setup.terms), bars
         )
-        setup = _with_actuators(setup, stribeck=choices.stribeck.velocity)
+        setup = _with_actuators(setup, stribeck=choices.stribeck.value)
     return setup
 
 
-MARGINS = (None, 0.03, 0.06)
-"""Times around changes of contact without which fits are tried [s]."""
-
-MOST_TRIED = 20_000
-"""Samples of a log that settings are chosen with."""
-
-_RADII = (0.0, 0.015, 0.03, 0.045)  # [m] of balls about the frames of feet
-_OCTAVES, _LOWEST_HZ = 8, 2.5  # of cutoffs that are tried, and the lowest: nobody moves slower to be identified
-_PERIODS = 12.0 * DROPPED_PERIODS  # of a cutoff in the shortest log, at least: of a fourth held back a third is left
-_LEAST_LEFT = 0.3  # of the rows, that a setting may leave
-_WIDTH_GAIN = 0.05  # decrease of the squared error that a width is worth: no body can make up for it
-_TRIED_WIDTHS = (0.01, 0.1)  # [rad/s or m/s]: where neither predicts better than the sign, no width is looked for
-
-
-@dataclass(frozen=True)
-class DataChoice:
-    """Which data are fitted: a value of a setting that leaves some out, and what was tried."""
-
-    value: float | bool | None
-    tried: tuple[float | bool | None, ...]
-
-    def __str__(self) -> str:
-        """The value, and why."""
-        if self.value == self.tried[0]:
-            return f"{_in_words(self.value)}: a fit without these samples predicts left-out blocks no better"
-        return f"{_in_words(self.value)}: a fit to all samples predicts left-out blocks worse"
-
-
-def _in_words(value: float | bool | None) -> str:
-    if value is None or isinstance(value, bool):
-        return {None: "none", False: "counted", True: "left out"}[value]
-    return f"{value:g} s"
-
-
-@dataclass(frozen=True)
-class RadiusChoice:
-    """A radius of feet that are balls about their frames [m]; None where what the robot's file has predicts as well.
-
-    `evidence`: for the radius, against what the file has.
-    """
-
-    radius: float | None
-    evidence: Evidence
-
-    def __str__(self) -> str:
-        if self.radius is None:
-            return "of the robot's file: balls about the frames of the feet predict left-out blocks no better"
-        return f"balls of {1e3 * self.radius:.3g} mm about the frames (error on left-out blocks {self.evidence})"
+def _chosen(name: str, choose: Callable[[], Chosen], bars: Progress) -> Chosen:
+    """What the first process chooses."""
+    bar = bars.add_task(f"choosing the {name}", total=None)
+    choice = distributed.from_first(choose, name)
+    bars.update(bar, total=1, completed=1)
+    return choice
 
 
 class _Trials:
@@ -370,79 +338,29 @@ def with_sample_rates(choices: Choices, setup: RobotSetup, logs: Sequence[Sample
     return replace(choices, sample_rate=SampleRates(rates))
 
 
-def _chosen(name: str, choose: Callable[[], Chosen], bars: Progress) -> Chosen:
-    """What the first process chooses."""
-    bar = bars.add_task(f"choosing the {name}", total=None)
-    choice = distributed.from_first(choose, name)
-    bars.update(bar, total=1, completed=1)
-    return choice
-
-
 def _cutoff(setup: RobotSetup, trials: _Trials, limit: CutoffChoice, shortest: float) -> CutoffChoice:
     """The widest band that the model predicts, up to a limit; `shortest`: how long the shortest log is [s]."""
     widest_hz, lowest_hz = setup.config.preprocessing.filter_hz or 0.0, max(_LOWEST_HZ, _PERIODS / shortest)
     tried = [widest_hz / 2**k for k in range(_OCTAVES) if not k or widest_hz / 2**k >= lowest_hz]
     setups = {cutoff: _with_preprocessing(setup, cutoff_hz=cutoff) for cutoff in tried}
-    found = _narrowest_needed(trials, setups, estimate_noise=True).value
+    found = _data(setups, trials, estimate_noise=True).value
     return limit if found == tried[0] else replace(limit, cutoff_hz=float(f"{found:.2g}"), limit_hz=limit.cutoff_hz)
 
 
-def _narrowest_needed(trials: _Trials, setups: Mapping[Any, RobotSetup], estimate_noise: bool = False) -> DataChoice:
-    """Of settings that leave ever more out, the first whose fit predicts what the others keep as well as theirs."""
-    readings: list[Reading] = []
-    kinds = trials.kinds(next(iter(setups.values())))
-    for one in setups.values():
-        try:
-            reading = trials.reading(one, estimate_noise)
-            if readings and reading.rows.sum() < _LEAST_LEFT * readings[0].rows.sum():
-                break
-            readings.append(reading)
-        except InputError:  # nothing is left
-            if not readings:
-                raise
-            break
-    return DataChoice([*setups][widest(readings, kinds)], tuple(setups))
+def _data(setups: Mapping[Any, RobotSetup], trials: _Trials, estimate_noise: bool = False) -> Profile:
+    """What `choose_data` makes of setups that leave ever more samples out, or more of the band."""
+    readings = {value: partial(trials.reading, one, estimate_noise) for value, one in setups.items()}
+    return choose_data(readings, trials.kinds(next(iter(setups.values()))))
 
 
-def _radius(setup: RobotSetup, trials: _Trials) -> RadiusChoice:
-    """The radius of balls about the frames of feet that predicts left-out blocks best, to second order in it."""
-    kinds = trials.kinds(setup)
+def _radius(setup: RobotSetup, trials: _Trials) -> Profile:
+    def read(radius: float | None) -> Reading:
+        return trials.reading(setup if radius is None else with_radius(setup, radius))
 
-    def left(radius: float, estimate_noise: bool = False) -> Array:
-        return trials.reading(with_radius(setup, radius), estimate_noise).left_out(kinds)
-
-    own = trials.reading(setup).left_out(kinds)
-    try:
-        tried = [left(radius) for radius in _RADII]
-    except InputError:  # the logs do not say where the ground is
-        return RadiusChoice(None, Evidence(0.0, 0.0, 0))
-    a, b, _ = np.polyfit(_RADII, [-Evidence.of(own, one).gain for one in tried], 2)
-    best, evidence = float(f"{-0.5 * b / a:.3g}") if a > 0.0 else 0.0, Evidence(0.0, 0.0, 0)
-    if _RADII[0] < best < _RADII[-1]:
-        evidence = Evidence.of(own, left(best))
-    if not evidence.adopted:
-        return RadiusChoice(None, evidence)
-    left(best, estimate_noise=True)  # which other choices are made with
-    return RadiusChoice(best, evidence)
-
-
-def _sign_width(setup: RobotSetup, trials: _Trials) -> SignWidthChoice:
-    """The width with which left-out blocks are predicted best; none where a trial does no better than the sign."""
-    kinds = trials.kinds(setup)
-
-    def read(width: float | None) -> Reading:
-        return trials.reading(_with_actuators(setup, sign_width=width))
-
-    sign, *others = map(read, (None, *_TRIED_WIDTHS))
-    found = [Evidence.of(sign.left_out(kinds), one.left_out(kinds)) for one in others]
-    if not any(one.certain and one.gain > _WIDTH_GAIN for one in found):
-        return SignWidthChoice(None, (None,), (1.0,))
-
-    def tried(width: float | None) -> tuple[float, Array]:
-        reading = read(width)
-        return math.sqrt(reading.noise_variance), reading.left_out(kinds)
-
-    return choose_sign_width(tried)
+    choice = choose_radius(read, trials.kinds(setup))
+    if choice.value is not None:
+        trials.reading(with_radius(setup, choice.value), estimate_noise=True)  # which other choices are made with
+    return choice
 
 
 def _cutoff_of_motion(setup: RobotSetup) -> tuple[CutoffChoice, float]:

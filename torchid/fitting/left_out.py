@@ -221,9 +221,9 @@ def _eliminated(gram: Array, own: Sequence[int], rest: Sequence[int]) -> Array:
     return np.asarray(gram[np.ix_(rest, rest)] - across.T @ np.linalg.pinv(gram[np.ix_(own, own)]) @ across)
 
 
-def thinned(logs: Sequence[Samples]) -> list[Samples]:
-    """About `SAMPLES` of all logs, evenly spaced, with the rate of the torques as the column of a delay."""
-    step, out = max(1, sum(map(len, logs)) // SAMPLES), []
+def thinned(logs: Sequence[Samples], count: int = SAMPLES) -> list[Samples]:
+    """About so many samples of all logs, evenly spaced, with the rate of the torques as the column of a delay."""
+    step, out = max(1, sum(map(len, logs)) // count), []
     for log in logs:
         some: dict[str, object] = {"folder": None, "motion_noise": None, "unloaded": None}
         if log.torque is not None and len(log) > 1:

@@ -63,7 +63,7 @@ class ExtraTerms:
     sign(v) exp(-(v / v_s)^2) (Armstrong-Hélouvry, Dupont and Canudas de Wit, "A survey of models, analysis tools and
     compensation methods for the control of machines with friction", 1994, with an exponent of 2).
 
-    `slope`: one further unknown of a search, see `torchid.fitting.separable`; its column is the `slope` of the samples.
+    `slope`: one further unknown of a search, see `torchid.fitting.profile`; its column is the `slope` of the samples.
     """
 
     offsets: Mapping[str, str] = field(default_factory=dict)
