@@ -23,8 +23,8 @@ from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import ConfigError, NumericalWarning, warn_about_file
 from torchid.estimators import Estimate, violations
 from torchid.estimators.conditions import term_violations
-from torchid.fitting.calibration import Comparison, warn_of_confounded, warn_of_masked
-from torchid.fitting.cross_validation import Scorer, calibrations_without_folds
+from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_masked
+from torchid.fitting.cross_validation import Scorer, TrainingScore, calibrations_without_folds
 from torchid.fitting.experiment import Experiment, set_up, with_noise, with_task_weights
 from torchid.fitting.factor_files import FactorFile, read_fleet
 from torchid.fitting.fit import Fit, LogFitter
@@ -33,10 +33,10 @@ from torchid.fitting.noise import NoiseSummary, misfit, resting_joints, unfitted
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
-from torchid.identifiability.confounding import LEAST_BLOCKS, mass_weights
-from torchid.identifiability.information import contributions
+from torchid.identifiability.confounding import LEAST_BLOCKS, TotalMass, mass_weights
+from torchid.identifiability.information import Contributions, contributions
 from torchid.parallel import one_thread
-from torchid.parameters import PER_BODY, Array
+from torchid.parameters import PER_BODY
 from torchid.problem import Metrics, RowBuilder, Samples
 from torchid.problem.compression import (
     BY_FOLD,
@@ -94,74 +94,38 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
     with clock("read"):
         experiment = set_up(config)
         conditions = experiment.conditions()
-        training = None
         if config.estimator.name == "sgd":
             descent_settings(config)  # before any work
     data = (_data_of_factors if config.logs.compressed else _data_of_logs)(experiment, clock, bars)
-    with clock("ridge"):
-        experiment, ridge = with_ridge(data.experiment, data.parts, data.blocks, data.builder, conditions, bars)
     logs, builder = data.logs, data.builder
-    fitter = experiment.fitter(builder, conditions)
-    checked, evaluation = TrainingLogs(experiment, bars), experiment.evaluation(experiment.noise_of_readings)
+    with clock("ridge"):
+        experiment, ridge = with_ridge(data.experiment, data.parts, data.blocks, builder, conditions, bars)
+    fitter, checked = experiment.fitter(builder, conditions), TrainingLogs(experiment, bars)
+    evaluation = experiment.evaluation(experiment.noise_of_readings)
 
     with clock("solve"):
-        solve = None
+        training, solve = None, None
         if config.estimator.name == "sgd":
             require_plausible(fitter.fit(data.parts), checked)
             training = Training(experiment)
-
-            def errors(phi: Array) -> dict[str, Metrics]:
-                return {name: evaluation.metrics(logs[name], phi[None])[0] for name in LOG_SETS if logs[name]}
-
-            solve = partial(training.run, data.parts, fitter=fitter, logs=logs, evaluate=errors, bars=bars,
+            solve = partial(training.run, data.parts, fitter=fitter, logs=logs, evaluation=evaluation, bars=bars,
                             resume=resume)  # fmt: skip
         fit, robust = _robust(fitter.fit(data.parts, solve), data, fitter, bars)
-        gains = distributed.from_first(
-            partial(gain_deviations, logs["train"], fitter, experiment.terms, config.sensors.gain_error), "gains"
-        )
-        fit = replace(fit, estimate=replace(fit.estimate, gain_error=np.linalg.norm(gains, axis=0)))
-        gain_error = float(np.linalg.norm(gains @ mass_weights(len(experiment.robot.bodies))))
-        mass = require_plausible(fit, checked, logs["train"], gain_error)
-        warn_of_confounded([x for x in fit.extras if x.extra.what not in data.choices.adopted_terms])
-        warn_of_masked(fit.parts, builder)
-        if experiment.sensors.task_weights is not None and fit.jackknife is None:  # its errors alone know of weights
-            found = f"set, of logs of fewer than {LEAST_BLOCKS} blocks, whose scatter intervals come from"
-            raise ConfigError.at_field("estimator.task_weights", found, "longer logs, or no such key")
+        fit, mass = _judged(fit, fitter, data, checked)
         data.parts = []
         problem, compared = fit.assembly.problem, experiment.calibrations(fit, builder)
         shown = [*logs["test"], *logs["train"]][:1]
         forces = distributed.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
-
     with clock("identifiability"):
-        parts = fit.parts
-        if data.factors:  # by contact state
-            parts = [*(part for x in data.factors for part in x.log.by_state), *(x for x in parts if x.unloaded)]
-        whole = merge(parts, builder, "source", "state", "unloaded")
-        by_state = _by_state(fitter, whole)
-        leaving_out = bars.add_task("leaving out each in turn", total=None)
-        names, tolerance = experiment.robot.dof_names, config.estimator.rank_tolerance
-        done = partial(bars.advance, leaving_out)
-        added = distributed.from_first(
-            lambda: contributions(whole, logs["train"], builder, problem, names, tolerance, done), "contributions"
-        )
-        bars.update(leaving_out, total=1, completed=1)
-
+        by_state, added = _identifiability(fit, fitter, data, bars)
     with clock("evaluate"):
-        without_folds = calibrations_without_folds(fit, fitter)
         scorer = Scorer(evaluation, builder)
-        unseen = sum(map(len, logs["test"]))
-        task = bars.add_task("evaluating", total=scorer.scored(data.blocks)[1] + unseen)
-        done = partial(bars.advance, task)
-        train = scorer.score_training(data.blocks, merge(fit.parts, builder, *BY_FOLD), compared, without_folds, done)
-        metrics: dict[str, Comparison[Metrics]] = {"train": train.metrics}
-        evaluated = {"train": train.samples}
-        if logs["test"]:
-            metrics["test"] = scorer.score_logs(logs["test"], compared, done)
-            evaluated["test"] = unseen
+        train, metrics, evaluated = _errors(scorer, fit, fitter, compared, data, bars)
         traces = distributed.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
         friction = unfitted_friction(problem, experiment.robot)
 
     phi, scale = (x.reshape(-1, PER_BODY) for x in (fit.estimate.phi, problem.scale))
+    terms_beyond = term_violations(problem, fit.estimate.phi, fit.estimate.psi)
     run = Identification(
         experiment=experiment,
         estimate=fit.estimate,
@@ -177,10 +141,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         contributions=added,
         metrics=metrics,
         evaluated=evaluated,
-        violations=[
-            *violations(phi, scale, conditions),
-            *term_violations(problem, fit.estimate.phi, fit.estimate.psi),
-        ],
+        violations=[*violations(phi, scale, conditions), *terms_beyond],
         seconds=clock.seconds,
         samples=sum(map(len, data.blocks)),
         factors=data.factors,
@@ -197,6 +158,77 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
     data.blocks = []
     require_not_worse(run.worse, run.metrics["train"].identified, experiment.sensors, checked)
     return replace(run, suspected=suspected_mistake(run, checked)), training
+
+
+def _judged(fit: Fit, fitter: LogFitter, data: TrainingData, checked: TrainingLogs) -> tuple[Fit, TotalMass]:
+    """The fit with errors by the sensors' gains, and its total mass, once it is plausible.
+
+    Raises:
+        ImplausibleFitError: no robot can have left it.
+        ConfigError: task weights, with logs too short for the intervals that know of these.
+    """
+    experiment, train = data.experiment, data.logs["train"]
+    gains = distributed.from_first(
+        partial(gain_deviations, train, fitter, experiment.terms, experiment.config.sensors.gain_error), "gains"
+    )
+    fit = replace(fit, estimate=replace(fit.estimate, gain_error=np.linalg.norm(gains, axis=0)))
+    gain_error = float(np.linalg.norm(gains @ mass_weights(len(experiment.robot.bodies))))
+    mass = require_plausible(fit, checked, train, gain_error)
+    warn_of_confounded([x for x in fit.extras if x.extra.what not in data.choices.adopted_terms])
+    warn_of_masked(fit.parts, fitter.builder)
+    if experiment.sensors.task_weights is not None and fit.jackknife is None:  # its errors alone know of weights
+        found = f"set, of logs of fewer than {LEAST_BLOCKS} blocks, whose scatter intervals come from"
+        raise ConfigError.at_field("estimator.task_weights", found, "longer logs, or no such key")
+    return fit, mass
+
+
+def _identifiability(
+    fit: Fit, fitter: LogFitter, data: TrainingData, bars: Progress
+) -> tuple[dict[str, Estimate], Contributions]:
+    """What each contact state determines on its own, most frequent first, and what each log, state and sensor adds."""
+    builder, robot = fitter.builder, fitter.robot
+    parts = fit.parts
+    if data.factors:  # by contact state
+        parts = [*(part for x in data.factors for part in x.log.by_state), *(x for x in parts if x.unloaded)]
+    whole = merge(parts, builder, "source", "state", "unloaded")
+    samples = Counter[ContactState]()
+    for part in whole:
+        samples[part.state] += part.samples
+    by_state = {}
+    for state, _ in samples.most_common():
+        problem = fitter.assemble([part for part in whole if part.state == state]).problem
+        by_state[state_name(builder.contacts, state)] = fitter.least_squares.solve(problem)
+    bar = bars.add_task("leaving out each in turn", total=None)
+    problem, tolerance = fit.assembly.problem, fitter.estimator.rank_tolerance
+    done = partial(bars.advance, bar)
+    added = distributed.from_first(
+        lambda: contributions(whole, data.logs["train"], builder, problem, robot.dof_names, tolerance, done),
+        "contributions",
+    )
+    bars.update(bar, total=1, completed=1)
+    return by_state, added
+
+
+def _errors(
+    scorer: Scorer,
+    fit: Fit,
+    fitter: LogFitter,
+    compared: Comparison[Calibration],
+    data: TrainingData,
+    bars: Progress,
+) -> tuple[TrainingScore, dict[str, Comparison[Metrics]], dict[str, int]]:
+    """Errors on the training logs, with cross-validation, and by set of logs, with the number of samples of each."""
+    test, without_folds = data.logs["test"], calibrations_without_folds(fit, fitter)
+    unseen = sum(map(len, test))
+    done = partial(bars.advance, bars.add_task("evaluating", total=scorer.scored(data.blocks)[1] + unseen))
+    parts = merge(fit.parts, fitter.builder, *BY_FOLD)
+    train = scorer.score_training(data.blocks, parts, compared, without_folds, done)
+    metrics: dict[str, Comparison[Metrics]] = {"train": train.metrics}
+    evaluated = {"train": train.samples}
+    if test:
+        metrics["test"] = scorer.score_logs(test, compared, done)
+        evaluated["test"] = unseen
+    return train, metrics, evaluated
 
 
 # ------------------------------------------------------------------------------------------------------- what is fitted
@@ -317,15 +349,3 @@ def _robust(fit: Fit, data: TrainingData, fitter: LogFitter, bars: Progress) -> 
         message = f"estimator.robust: not converged after {robust.summary.passes} passes; accepted: more passes"
         warn_about_file(message, NumericalWarning)
     return robust.fit, robust.summary
-
-
-def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
-    """What each contact state determines on its own, by least squares, most frequent first."""
-    samples = Counter[ContactState]()
-    for part in parts:
-        samples[part.state] += part.samples
-    out = {}
-    for state, _ in samples.most_common():
-        problem = fitter.assemble([part for part in parts if part.state == state]).problem
-        out[state_name(fitter.builder.contacts, state)] = fitter.least_squares.solve(problem)
-    return out

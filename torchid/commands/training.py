@@ -41,16 +41,27 @@ from torchid.fitting.experiment import Experiment
 from torchid.fitting.fit import LogFitter
 from torchid.guards import check_regular
 from torchid.parameters import PARAMETERS, Array
-from torchid.problem import LinearProblem, Metrics, MiniBatches, Samples, TriangularFactor, assemble, compress_parts
+from torchid.problem import (
+    Evaluation,
+    LinearProblem,
+    Metrics,
+    MiniBatches,
+    Samples,
+    TriangularFactor,
+    assemble,
+    compress_parts,
+)
 from torchid.problem.compression import Part
 from torchid.problem.elimination import Assembly
 from torchid.problem.linear import parameter_scale
+from torchid.problem.metrics import LOG_SETS
 from torchid.robot import Robot
 
 if TYPE_CHECKING:
     from torchid.report.tensorboard import RunEvents
 
 Evaluate = Callable[[Array], Mapping[str, Metrics]]
+"""Errors of parameters (12 L,) by set of logs."""
 _FREE_TO_CHANGE = ("output", "overwrite", "figures.format")
 _SAME = 1e-9  # relative: the logs of a checkpoint, up to rounding
 
@@ -111,7 +122,7 @@ class Training:
         problem: LinearProblem,
         fitter: LogFitter,
         logs: Mapping[str, Sequence[Samples]],
-        evaluate: Evaluate,
+        evaluation: Evaluation,
         bars: Progress,
         resume: bool,
     ) -> SgdEstimate:
@@ -121,8 +132,8 @@ class Training:
             parts: the training logs, compressed.
             problem: that they pose, with what is free.
             fitter: of their rows.
-            logs: "train" and "validation".
-            evaluate: metrics on sets of logs, of one parameter vector (12 L,).
+            logs: "train", "validation" and "test".
+            evaluation: of the forces of these and of the test logs, for the curves.
             bars: for the progress.
             resume: whether to go on from the checkpoint, if there is one.
 
@@ -149,6 +160,10 @@ class Training:
             self._saved = trainer.epoch
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
         since = trainer.epoch + 1 if trainer.epoch else 0
+
+        def evaluate(phi: Array) -> dict[str, Metrics]:
+            return {name: evaluation.metrics(logs[name], phi[None])[0] for name in LOG_SETS if logs[name]}
+
         with self._interruptible(trainer), self._curves(since) as events:
             if events is not None:
                 known = known_parameters(self.robot, trainer.closed_form, trainer.phi())
