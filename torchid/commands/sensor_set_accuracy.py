@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 from torchid import distributed
 from torchid.commands.plausibility import TrainingLogs, require_plausible
 from torchid.errors import ImplausibleFitError, LogError, warn
-from torchid.fitting.calibration import Calibration, list_confounded
+from torchid.estimators.least_squares import Minimizer
+from torchid.fitting.calibration import calibration_at, list_confounded
 from torchid.fitting.experiment import RobotSetup, batch_estimator
 from torchid.parallel import share_between_forks, thread_count
-from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import split_into_folds
 from torchid.problem.elimination import Assembly
@@ -54,27 +54,8 @@ def accuracies(
     return {name: one for name, one in found if one is not None}
 
 
-@dataclass(frozen=True)
-class _Reference:
-    """Sensors whose readings predictions are compared with, and their extra parameters by the training logs."""
-
-    setup: RobotSetup
-    builder: RowBuilder
-    assembly: Assembly
-
-    def calibration(self, phi: Array) -> Calibration:
-        assembly = self.assembly
-        values = {
-            (elimination.log, extra.label): float(value)
-            for elimination, own in zip(assembly.eliminations, assembly.extras_at(phi), strict=True)
-            for extra, value in zip(elimination.extras, own, strict=True)
-        }
-        robot = self.setup.robot
-        return Calibration(robot=robot, builder=self.builder, phi=phi, values=values)
-
-
-def _reference(setup: RobotSetup, train: Sequence[Samples]) -> _Reference | None:
-    """All sensors, None if some log lacks one or there is nothing to calibrate."""
+def _reference(setup: RobotSetup, train: Sequence[Samples]) -> tuple[Assembly, RowBuilder] | None:
+    """The training logs' rows of all sensors, which extra parameters are taken from; None if a log lacks a sensor."""
     robot = setup.robot
     sensors = named_sensors("full", robot.n, len(setup.contacts), setup.noise, len(robot.ft_names))
     sensors = with_ft_sensors(sensors, robot, robot.ft_names)
@@ -86,7 +67,7 @@ def _reference(setup: RobotSetup, train: Sequence[Samples]) -> _Reference | None
             require_forces(samples, robot, setup.contacts, sensors)
     except LogError:
         return None
-    return _Reference(setup, builder, assemble(compress_parts(train, builder), builder, robot))
+    return assemble(compress_parts(train, builder), builder, robot), builder
 
 
 def _accuracy(
@@ -95,7 +76,7 @@ def _accuracy(
     train: Sequence[Samples],
     test: Sequence[Samples],
     evaluation: Evaluation,
-    reference: _Reference | None,
+    reference: tuple[Assembly, RowBuilder] | None,
 ) -> SetAccuracy:
     settings = setup.config.estimator
     builder, conditions = setup.builder(sensors), setup.conditions()
@@ -110,7 +91,8 @@ def _accuracy(
     fit = fitter.fit(parts, batch_estimator(settings, conditions).solve)
     require_plausible(fit, TrainingLogs(setup))
     estimate = fit.estimate
-    calibration = (reference or _Reference(setup, builder, fit.assembly)).calibration(estimate.phi)
+    assembly, builder = reference or (fit.assembly, builder)
+    calibration = calibration_at(assembly, Minimizer(estimate.phi), setup.robot, builder)
     phi = calibration.parameters(evaluation)
     measured = evaluation.metrics(calibration.calibrate(test), phi[None])[0] if test else None
     possible = measured_components(setup.contacts, sensors)

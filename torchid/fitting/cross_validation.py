@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchid import distributed
 from torchid.errors import LogError, TorchidWarning
@@ -19,12 +17,10 @@ from torchid.fitting.fit import BatchEstimator, Fit, LogFitter, LogProblem
 from torchid.parallel import one_thread, share_between_processes, thread_count
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples
-from torchid.problem.chunks import ProgressCallback, map_chunks
-from torchid.problem.compression import BY_FOLD, Block, Part, compress_parts, compress_unloaded, merge, split_into_folds
-from torchid.problem.contact_state import ContactState
+from torchid.problem.chunks import ProgressCallback
+from torchid.problem.compression import BY_FOLD, Block, Part, compress_parts, merge, split_into_folds
 from torchid.problem.elimination import Assembly
 from torchid.problem.metrics import ForceSums
-from torchid.problem.rows import Workspace
 from torchid.sensing.sensors import recorded_components
 from torchid.settings import RidgeRule
 
@@ -41,21 +37,14 @@ def with_all_readings(log: Samples, builder: RowBuilder) -> Samples:
     return log if bool(known.all()) else log[known]
 
 
-@dataclass
+@dataclass(frozen=True)
 class ResidualSquares:
     """Sums of squares of whitened rows: of their residuals, of what was measured, and of the noise a filter leaves."""
 
-    error: float = 0.0
-    measured: float = 0.0
-    noise: float = 0.0
-    rows: int = 0
-
-    def add(self, other: ResidualSquares) -> None:
-        """Add those of other rows."""
-        self.error += other.error
-        self.measured += other.measured
-        self.noise += other.noise
-        self.rows += other.rows
+    error: float
+    measured: float
+    noise: float
+    rows: int
 
 
 @one_thread()
@@ -64,48 +53,14 @@ def sum_residuals(
 ) -> list[ResidualSquares]:
     """Squares of the residuals of bound logs' rows, compressed to `parts`, at the parameters of each calibration."""
     by_source = {log.source: log for log in reversed(logs)}
-    out = [ResidualSquares() for _ in calibrations]
+    sums = np.zeros((len(calibrations), 4))
     for part in parts:
-        R, factor = part.factor.triangle(), part.factor
-        for one, squares in zip(calibrations, out, strict=True):
-            residual = R[:, :-1] @ one.columns(builder, by_source[part.source]).cpu() - R[:, -1]
-            sums = float(residual @ residual), float(R[:, -1] @ R[:, -1])
-            squares.add(ResidualSquares(*sums, factor.rows * by_source[part.source].noise_left, factor.rows))
-    return out
-
-
-def residuals_of_samples(
-    builder: RowBuilder, logs: Sequence[Samples], calibrations: Sequence[Calibration]
-) -> list[ResidualSquares]:
-    """As `sum_residuals`, of logs that are not compressed: rows times parameters are less work than their factors.
-
-    Args:
-        builder: of the rows.
-        logs: bound logs, of other sources each.
-        calibrations: parameters.
-    """
-    phi = {log.source: torch.stack([one.columns(builder, log) for one in calibrations], dim=1) for log in logs}
-    total = sum_residuals(builder, logs, compress_unloaded(logs, builder), calibrations)
-    for squares, measured, noise, rows in map_chunks(logs, builder, partial(_sum_chunks, builder, phi)):
-        for one, error in zip(total, squares, strict=True):
-            one.add(ResidualSquares(error, measured, noise, rows))
-    return total
-
-
-def _sum_chunks(
-    builder: RowBuilder, phi: Mapping[str, Tensor], chunks: Iterator[tuple[Samples, ContactState]]
-) -> tuple[list[float], float, float, int]:
-    """Squares of the residuals of rows at parameters (width, M) by log, (M,), and of what was measured; noise, rows."""
-    error = next(iter(phi.values())).new_zeros(next(iter(phi.values())).shape[1])
-    sums, workspace = error.new_zeros(3, dtype=torch.float64), Workspace()
-    for samples, state in chunks:
-        for support, rows in builder.rows(samples, state, workspace):
-            error += (rows[:, :-1] @ phi[samples.source][builder.tree.index(support)] - rows[:, -1:]).square().sum(0)
-            sums[0] += rows[:, -1].square().sum()
-            present = len(rows) if samples.resting is None else rows.any(1).sum(dtype=torch.float64)
-            sums[1] += present * samples.noise_left
-            sums[2] += present
-    return error.tolist(), float(sums[0]), float(sums[1]), round(float(sums[2]))
+        R, log = part.factor.triangle(), by_source[part.source]
+        measured, rows = float(R[:, -1] @ R[:, -1]), part.factor.rows
+        for number, one in enumerate(calibrations):
+            residual = R[:, :-1] @ one.columns(builder, log).cpu() - R[:, -1]
+            sums[number] += float(residual @ residual), measured, rows * log.noise_left, rows
+    return [ResidualSquares(*squares, rows=int(rows)) for *squares, rows in sums.tolist()]
 
 
 RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
@@ -323,8 +278,8 @@ class Scorer:
         Rows of the fit's sensors count where a log has all their readings.
         """
         pairs = self._force_sums(logs, {log.fold: compared for log in logs} or {0: compared}, progress, 1)
-        whole = [with_all_readings(log, self.builder) for log in logs]
-        _add_squares(pairs, residuals_of_samples(self.builder, whole, compared))
+        whole = [with_all_readings(replace(log, motion_noise=None), self.builder) for log in logs]
+        _add_squares(pairs, sum_residuals(self.builder, whole, compress_parts(whole, self.builder), compared))
         return Comparison(*(self.evaluation.summarize(*pair) for pair in pairs))
 
     def score_training(
