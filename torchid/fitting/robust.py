@@ -16,17 +16,11 @@ from torchid import distributed
 from torchid.errors import UnknownNameError
 from torchid.estimators import ConstrainedEstimate
 from torchid.fitting.fit import Fit, LogFitter, Solve, with_block_errors
-from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback
-from torchid.problem.compression import (
-    Part,
-    add_noise_gram,
-    compress_in_blocks,
-)
-from torchid.problem.noise_gram import NoiseGram, PartKey
+from torchid.problem.compression import Part, add_noise_gram, compress_in_blocks
 from torchid.problem.row_compressor import RowWeighting
 from torchid.problem.samples import concatenate
 from torchid.rounding import MAD_PER_STD
@@ -142,97 +136,99 @@ def fit_robustly(
     builder = fitter.builder
     parts = compress_in_blocks(logs, builder, progress=progress) if parts is None else parts
     first = fitter.fit(parts, solve) if first is None else first
-    noise_gram = {part.key: part.factor.noise_gram for part in parts if part.factor.noise_gram}
-    start, first_pass = _Point(first, first.estimate.residual_std), 0
-    step = min(sum(map(len, logs)) // _ROUGH_SAMPLES, min(map(len, logs)) // _LEAST_ROUGH)
-    step = min(step, max(_ROUGH_STEP, sum(map(len, logs)) // _MOST_ROUGH))
+    start = _Passes(first, first, first.estimate.residual_std)
+    count = sum(map(len, logs))
+    step = min(count // _ROUGH_SAMPLES, min(map(len, logs)) // _LEAST_ROUGH)
+    step = min(step, max(_ROUGH_STEP, count // _MOST_ROUGH))
     if step >= _WORTHWHILE:
-        start, first_pass = _passes(_some_rows(logs, noise_gram, step, fitter), loss, start, solve=solve).next, _START
-    every = _Rows(
-        fitter, partial(compress_in_blocks, logs, builder, progress), noise_gram, {log.source for log in logs}
-    )
-    found = _passes(every, loss, start, first_pass, solve)
+        by_log: dict[str, list[Samples]] = {}
+        for log in logs:
+            by_log.setdefault(log.source, []).append(log.every(step))
+        rough = [replace(concatenate(pieces), fold=0, block=0) for pieces in by_log.values()]
+        compress = partial(compress_parts, rough, builder)
+        start = _passes(start, fitter, lambda weigh: compress(weight_rows=weigh), compress(), loss, 0, solve)
+    compress_all = partial(compress_in_blocks, logs, builder, progress)
+    found = _passes(start, fitter, compress_all, parts, loss, _START if step >= _WORTHWHILE else 0, solve)
+    reweighting = found.reweighting
+    if reweighting is None:
+        raise ValueError(f"passes: found {loss.passes}; accepted: at least 1")
     summary = RobustSummary(
         loss=loss.kind,
         tuning=loss.tuning,
-        scale=found.next.scale,
-        mean_weight=found.reweighting.mean_weight,
+        scale=found.scale,
+        mean_weight=reweighting.mean_weight,
         passes=found.done,
         converged=found.converged,
     )
-    return RobustFit(_with_errors(found.fit, found.reweighting), summary)
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Rows to pass over: what compresses them with weights, noise Gram matrices of the parts, and the logs."""
-
-    fitter: LogFitter
-    compress: Callable[[RowWeighting], list[Part]]
-    noise_gram: Mapping[PartKey, NoiseGram]
-    sources: set[str]
-
-
-def _some_rows(logs: Sequence[Samples], noise_gram: Mapping[PartKey, NoiseGram], step: int, fitter: LogFitter) -> _Rows:
-    """Those of every so many samples, in one part of each log and contact state."""
-    by_log: dict[str, list[Samples]] = {}
-    for log in logs:
-        by_log.setdefault(log.source, []).append(log.every(step))
-    some = [replace(concatenate(pieces), fold=0, block=0) for pieces in by_log.values()]
-    of_some: dict[PartKey, NoiseGram] = {}
-    for key, of_part in noise_gram.items():
-        total = of_some.setdefault(key._replace(fold=0, block=0), {})
-        for support, x in of_part.items():
-            total[support] = total.get(support, 0.0) + x / step
-    return _Rows(fitter, lambda weigh: compress_parts(some, fitter.builder, weight_rows=weigh), of_some, set(by_log))
-
-
-@dataclass(frozen=True)
-class _Point:
-    """Where rows are weighted: the parameters of a fit, and the scale of residuals."""
-
-    fit: Fit
-    scale: float
-
-    def beyond(self, fit: Fit, scale: float, newton_ratio: float) -> _Point:
-        """Beyond a fit of the rows as they are weighted here, which falls short of the best by so much."""
-        step = min(newton_ratio, _FARTHEST)
-        earlier = {(x.log, x.extra.label): x.value for x in self.fit.extras}
-
-        def further(x: ExtraEstimate) -> ExtraEstimate:
-            before = earlier.get((x.log, x.extra.label), x.value)
-            return replace(x, value=before + step * (x.value - before))
-
-        before = self.fit.estimate.phi
-        estimate = replace(fit.estimate, phi=before + step * (fit.estimate.phi - before))
-        return _Point(replace(fit, estimate=estimate, extras=list(map(further, fit.extras))), scale)
+    return RobustFit(_with_errors(found.fit, reweighting), summary)
 
 
 @dataclass(frozen=True)
 class _Passes:
-    """What some passes have come to: the last fit, and where the next pass would weigh rows."""
+    """What some passes have come to: the last fit, and the parameters and the scale with which the next weighs rows."""
 
     fit: Fit
-    next: _Point
-    reweighting: Reweighting
-    done: int
-    converged: bool
+    at: Fit
+    scale: float
+    reweighting: Reweighting | None = None
+    done: int = 0
+    converged: bool = False
 
 
-def _passes(rows: _Rows, loss: RobustLoss, start: _Point, first_pass: int = 0, solve: Solve | None = None) -> _Passes:
-    """Passes over some rows, the first of them with the number given."""
-    converged, done, at, fitter = False, 0, start, rows.fitter
-    while done < loss.passes and not converged:
-        current = _loss_of_pass(loss, first_pass + done)
-        by_log = {source: at.fit.columns(fitter.builder, source) for source in rows.sources}
-        reweighting = Reweighting(current, by_log, max(at.scale, _TINY))
-        parts, done = rows.compress(reweighting), done + 1
-        add_noise_gram(parts, rows.noise_gram, reweighting.mean_weight)
-        fit, scale = fitter.fit(parts, solve), reweighting.median_scale
-        same = current == loss and _has_converged(fit, at.fit, at.scale, scale)
-        converged = distributed.broadcast(same, "convergence")
-        at = at.beyond(fit, scale, reweighting.newton_ratio)
-    return _Passes(fit, at, reweighting, done, converged)
+def _passes(
+    start: _Passes,
+    fitter: LogFitter,
+    compress: Callable[[RowWeighting], list[Part]],
+    unweighted: Sequence[Part],
+    loss: RobustLoss,
+    first_pass: int,
+    solve: Solve | None,
+) -> _Passes:
+    """Passes over rows, the first of them with the number given.
+
+    Args:
+        start: where they begin.
+        fitter: of the rows.
+        compress: the rows with weights.
+        unweighted: the same without.
+        loss: what residuals cost.
+        first_pass: passes that came before.
+        solve: instead of the fitter's estimator.
+    """
+    noise_gram = {part.key: part.factor.noise_gram for part in unweighted if part.factor.noise_gram}
+    sources = {part.source for part in unweighted}
+    found = replace(start, done=0, converged=False)
+    while found.done < loss.passes and not found.converged:
+        current = loss
+        if loss.kind != "huber" and first_pass + found.done < _START:  # Huber's loss is convex
+            current = replace(loss, kind="huber", tuning=TUNING["huber"])
+        at, scale = found.at, found.scale
+        by_log = {source: at.columns(fitter.builder, source) for source in sources}
+        reweighting = Reweighting(current, by_log, max(scale, _TINY))
+        parts = compress(reweighting)
+        add_noise_gram(parts, noise_gram, reweighting.mean_weight)
+        fit = fitter.fit(parts, solve)
+        same = current == loss and _has_converged(fit, at, scale, reweighting.median_scale)
+        found = _Passes(
+            fit=fit,
+            at=_beyond(at, fit, min(reweighting.newton_ratio, _FARTHEST)),
+            scale=reweighting.median_scale,
+            reweighting=reweighting,
+            done=found.done + 1,
+            converged=distributed.broadcast(same, "convergence"),
+        )
+    return found
+
+
+def _beyond(before: Fit, after: Fit, step: float) -> Fit:
+    """A fit of the rows as weighted at the one before, whose parameters moved so many times as far."""
+    earlier = {(x.log, x.extra.label): x.value for x in before.extras}
+    extras = []
+    for x in after.extras:
+        value = earlier.get((x.log, x.extra.label), x.value)
+        extras.append(replace(x, value=value + step * (x.value - value)))
+    phi = before.estimate.phi + step * (after.estimate.phi - before.estimate.phi)
+    return replace(after, estimate=replace(after.estimate, phi=phi), extras=extras)
 
 
 class Reweighting:
@@ -319,11 +315,6 @@ class Reweighting:
             return math.nan
         correction = 1.0 + unknowns / rows * (steep - slope**2) / slope**2
         return float(correction * self.scale * np.sqrt(weight * square * rows / (rows - unknowns)) / slope)
-
-
-def _loss_of_pass(loss: RobustLoss, done: int) -> RobustLoss:
-    """Huber's loss, which is convex, for the first passes."""
-    return loss if loss.kind == "huber" or done >= _START else replace(loss, kind="huber", tuning=TUNING["huber"])
 
 
 def _has_converged(fit: Fit, before: Fit, scale: float, new_scale: float) -> bool:
