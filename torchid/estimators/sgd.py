@@ -71,12 +71,12 @@ Gradients are then not clipped.
 
 def optimizer_names() -> list[str]:
     """Names of the classes in `torch.optim` that are supported: those in `OPTIMIZERS` that this torch has."""
-    return sorted(name for name, _ in _classes(torch.optim, Optimizer) if name in OPTIMIZERS)
+    return sorted(name for name in _classes(torch.optim, Optimizer) if name in OPTIMIZERS)
 
 
 def schedule_names() -> list[str]:
     """Names of the classes in `torch.optim.lr_scheduler`."""
-    return sorted(name for name, _ in _classes(lr_scheduler, LRScheduler))
+    return sorted(_classes(lr_scheduler, LRScheduler))
 
 
 def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimizer:
@@ -90,13 +90,9 @@ def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimi
         UnknownNameError: no class of `torch.optim`, or one that is not supported.
         InputError: an option it does not take.
     """
-    name, options = _split(chosen)
-    cls = dict(_classes(torch.optim, Optimizer)).get(name)
-    if cls is not None and name not in OPTIMIZERS:
-        accepted = ", ".join(optimizer_names())
-        raise InputError("estimator", f"optimizer {name}", "not supported", accepted)
-    if cls is None:
-        raise _unknown("optimizer", name, optimizer_names())
+    name, cls, options = _class_and_options(chosen, torch.optim, Optimizer, "optimizer", optimizer_names())
+    if name not in OPTIMIZERS:
+        raise InputError("estimator", f"optimizer {name}", "not supported", ", ".join(optimizer_names()))
     if name == "LBFGS" and len(groups) > 1:  # it takes one group
         if any("lr" in group for group in groups):
             raise InputError(
@@ -105,10 +101,8 @@ def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimi
         groups = [{"params": [x for group in groups for x in group["params"]]}]
     if name == "SGD":
         options = options or _PLAIN_SGD
-    try:
-        return cls(list(groups), **{**OPTIMIZERS[name], **options})
-    except _FAILURES as error:
-        raise InputError("estimator", f"optimizer {name}", _short(error), _accepted(cls)) from error
+    made: Optimizer = _construct(f"optimizer {name}", cls, list(groups), OPTIMIZERS[name] | options)
+    return made
 
 
 def make_schedule(chosen: Mapping[str, Any] | None, optimizer: Optimizer, epochs: int) -> LRScheduler | None:
@@ -125,15 +119,10 @@ def make_schedule(chosen: Mapping[str, Any] | None, optimizer: Optimizer, epochs
     """
     if chosen is None:
         return None
-    name, options = _split(chosen)
-    cls = dict(_classes(lr_scheduler, LRScheduler)).get(name)
-    if cls is None:
-        raise _unknown("schedule", name, schedule_names())
+    name, cls, options = _class_and_options(chosen, lr_scheduler, LRScheduler, "schedule", schedule_names())
     lengths = {key: epochs for key in _WHOLE_RUN if key in inspect.signature(cls).parameters}
-    try:
-        return cls(optimizer, **{**lengths, **options})
-    except _FAILURES as error:
-        raise InputError("estimator", f"schedule {name}", _short(error), _accepted(cls)) from error
+    made: LRScheduler = _construct(f"schedule {name}", cls, optimizer, lengths | options)
+    return made
 
 
 def step_schedule(schedule: LRScheduler | None, loss: float) -> None:
@@ -144,25 +133,31 @@ def step_schedule(schedule: LRScheduler | None, loss: float) -> None:
         schedule.step()
 
 
-def _split(chosen: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    options = dict(chosen)
-    return options.pop("name"), options
-
-
-def _classes(module: Any, base: type) -> list[tuple[str, Any]]:
+def _classes(module: Any, base: type) -> dict[str, Any]:
     members = inspect.getmembers(module, inspect.isclass)
-    return [(name, x) for name, x in members if issubclass(x, base) and x is not base and not name.startswith("_")]
+    return {name: x for name, x in members if issubclass(x, base) and x is not base and not name.startswith("_")}
 
 
-def _unknown(field: str, name: str, names: Sequence[str]) -> UnknownNameError:
-    """Error for an unknown name; it suggests one that differs in case only (difflib does not match `sgd` to SGD)."""
-    same = [known for known in names if known.lower() == name.lower()]
-    return UnknownNameError("estimator", field, name, same or names)
+def _class_and_options(
+    chosen: Mapping[str, Any], module: Any, base: type, kind: str, names: Sequence[str]
+) -> tuple[str, Any, dict[str, Any]]:
+    """Name and class of what was chosen, and its options. Raises UnknownNameError: the module has no such class."""
+    options = dict(chosen)
+    name = options.pop("name")
+    classes = _classes(module, base)
+    if name not in classes:
+        same = [known for known in names if known.lower() == name.lower()]  # difflib does not match `sgd` to SGD
+        raise UnknownNameError("estimator", kind, name, same or names)
+    return name, classes[name], options
 
 
-def _accepted(cls: Any) -> str:
-    options = [name for name in inspect.signature(cls).parameters if name not in ("params", "optimizer")]
-    return f"options {', '.join(options)}"
+def _construct(field: str, cls: Any, first: Any, options: Mapping[str, Any]) -> Any:
+    """An instance. Raises InputError: options that its class does not take."""
+    try:
+        return cls(first, **options)
+    except _FAILURES as error:
+        accepted = ", ".join(name for name in inspect.signature(cls).parameters if name not in ("params", "optimizer"))
+        raise InputError("estimator", field, _short(error), f"options {accepted}") from error
 
 
 def _short(error: Exception) -> str:
@@ -414,9 +409,19 @@ class Sgd(TrainingSettings, Regularized):
         return Consistent(self.ridge, self.prior, self.conditions, rank_tolerance=self.rank_tolerance)
 
 
-class Penalties(nn.Module):
-    """Penalties of a problem's bodies, and of terms beyond their bounds."""
+class Objective(nn.Module):
+    """What a descent minimizes beside the data, and on all samples, at deviations y, (n,), in units of their scale.
 
+    They are those of the free parameters, and the terms of the problem.
+    """
+
+    root: Tensor
+    target: Tensor
+    linear: Tensor
+    log_det_weight: Tensor
+    F0: Tensor
+    F: Tensor
+    variables: Tensor
     start: Tensor
     free: Tensor
     bodies: Tensor
@@ -424,25 +429,44 @@ class Penalties(nn.Module):
     h: Tensor
 
     def __init__(self, settings: Sgd, problem: LinearProblem) -> None:
-        """Of a descent's settings."""
+        """Of a descent's settings, and the compressed samples."""
         super().__init__()
-        self._margin = settings.conditions.margin
-        self._weights = settings.penalties
-        conic = settings.conic_problem(problem)
-        bounded = {condition.name for condition in problem.terms.conditions} if problem.terms else set()
+        self._margin, self._weights = settings.conditions.margin, settings.penalties
+        conic, terms = settings.conic_problem(problem), problem.terms
+        self.floor, self.constant = conic.floor, conic.constant
+        self._data_rows = min(len(problem.A) + (len(terms.C) if terms else 0), len(conic.linear))
+        inverse = np.linalg.inv(conic.deviations)
+        weighted = conic.weights > 0.0
+        of_blocks = inverse[conic.variables[weighted][:, :, None], conic.variables[weighted][:, None, :]]
+        bounded = {condition.name for condition in terms.conditions} if terms else set()
         rows = np.array([name in bounded for name in conic.names[len(conic.F0) :]], dtype=bool)
         arrays = {
+            "root": conic.root @ inverse,
+            "target": conic.target,
+            "linear": inverse.T @ conic.linear,
+            "log_det_weight": conic.weights[weighted],
+            "F0": conic.F0[weighted],
+            "F": np.einsum("kvw,kvij->kwij", of_blocks, conic.F[weighted]),
+            "variables": conic.variables[weighted],
             "start": problem.nominal / problem.scale,
             "free": problem.free,
             "bodies": problem.free_bodies(),
-            "G": np.linalg.solve(conic.deviations.T, conic.G[rows].T).T,
+            "G": conic.G[rows] @ inverse,
             "h": conic.h[rows],
         }
         for name, array in arrays.items():
-            self.register_buffer(name, torch.from_numpy(np.array(array)), persistent=False)
+            self.register_buffer(name, torch.from_numpy(np.array(array, order="C")), persistent=False)
 
-    def forward(self, y: Tensor) -> dict[str, Tensor]:
-        """By name, at deviations of the free parameters, and the terms, in units of their scale, (n,)."""
+    def prior(self, y: Tensor) -> Tensor:
+        """What the ridge weights."""
+        value = (self.root[self._data_rows :] @ y).square().sum() + self.linear @ y
+        if not len(self.F0):
+            return value
+        blocks = self.F0 + (y[self.variables][..., None, None] * self.F).sum(1)
+        return value - self.log_det_weight @ torch.linalg.eigvalsh(blocks).clamp_min(1e-300).log().sum(1)
+
+    def penalties(self, y: Tensor) -> dict[str, Tensor]:
+        """Of bodies, and of terms beyond their bounds, by name."""
         moved = self.start[self.free] + y[: int(self.free.sum())]
         scaled = self.start.masked_scatter(self.free, moved).unflatten(0, (-1, PER_BODY))
         out = penalties(scaled, self.bodies, self._margin, self._weights)
@@ -450,25 +474,16 @@ class Penalties(nn.Module):
             out["terms"] = self._weights.friction * (self.G @ y - self.h).clamp_max(0.0).square().sum()
         return out
 
-
-class _Penalized:
-    """The objective of a descent with penalties on all samples, at deviations (n,)."""
-
-    def __init__(self, settings: Sgd, problem: LinearProblem) -> None:
-        self._penalties = Penalties(settings, problem)
-        conic = settings.conic_problem(problem)
-        self.floor = conic.floor
-        root = np.linalg.solve(conic.deviations.T, conic.root.T).T
-        linear = np.linalg.solve(conic.deviations.T, conic.linear)
-        self._root, self._target, self._linear = map(torch.from_numpy, (root, conic.target, linear))
-        self._constant = conic.constant
-        self.hessian = 2.0 * self._root.T @ self._root
+    @property
+    def hessian(self) -> Tensor:
+        """Of the quadratic on all samples, (n, n)."""
+        return 2.0 * self.root.T @ self.root
 
     def slope(self, y: Array) -> tuple[float, Array]:
-        """Value and gradient."""
+        """The quadratic on all samples with penalties: value and gradient."""
         at = torch.from_numpy(np.array(y)).requires_grad_()
-        value = (self._root @ at - self._target).square().sum() + self._linear @ at + self._constant
-        value = value + sum(self._penalties(at).values())
+        value = (self.root @ at - self.target).square().sum() + self.linear @ at + self.constant
+        value = value + sum(self.penalties(at).values())
         (gradient,) = torch.autograd.grad(value, at)
         return value.item(), gradient.numpy()
 
@@ -485,7 +500,7 @@ def least_penalized(settings: Sgd, problem: LinearProblem, start: Minimizer) -> 
         problem: the compressed samples.
         start: where the descent ended.
     """
-    penalized, y = _Penalized(settings, problem), deviations(problem, start)
+    penalized, y = Objective(settings, problem), deviations(problem, start)
     damping = 1e-6 * float(penalized.hessian.diagonal().max()) + settings.penalties.curvature
     P = _inverse_root(penalized.hessian, damping).numpy()
 
@@ -534,7 +549,7 @@ def excess(settings: Sgd, problem: LinearProblem, found: Minimizer) -> float:
     what this promises along the gradient.
     """
     if settings.consistency == "penalties":
-        penalized = _Penalized(settings, problem)
+        penalized = Objective(settings, problem)
         value, slope = penalized.slope(deviations(problem, found))
         least = value - 0.5 * float(slope @ np.linalg.pinv(penalized.hessian.numpy(), hermitian=True) @ slope)
         return (value - least) / max(least, penalized.floor)

@@ -17,12 +17,11 @@ from torch import Tensor, nn
 
 from torchid import distributed, parameters
 from torchid.errors import InputError
-from torchid.estimators.conic_problem import ConicProblem
 from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, report_rounding
 from torchid.estimators.sgd import (
     FULL_BATCH,
     LearnableParameters,
-    Penalties,
+    Objective,
     Sgd,
     deviations,
     excess,
@@ -35,42 +34,6 @@ from torchid.estimators.sgd import (
 from torchid.parallel import one_thread
 from torchid.parameters import Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
-
-
-class _Prior(nn.Module):
-    """The prior of a conic problem as a function of deviations in units of their scale, (n,)."""
-
-    root: Tensor
-    linear: Tensor
-    log_det_weight: Tensor
-    F0: Tensor
-    F: Tensor
-    variables: Tensor
-
-    def __init__(self, conic: ConicProblem, rows: int) -> None:
-        """Of a problem whose first rows are those of the data."""
-        super().__init__()
-        inverse, weighted = np.linalg.inv(conic.deviations), conic.weights > 0.0
-        variables = conic.variables[weighted]
-        blocks = [inverse[np.ix_(at, at)] for at in variables]
-        F = [np.einsum("vw,vij->wij", block, F) for block, F in zip(blocks, conic.F[weighted], strict=True)]
-        arrays = {
-            "root": conic.root[rows:] @ inverse,
-            "linear": inverse.T @ conic.linear,
-            "log_det_weight": conic.weights[weighted],
-            "F0": conic.F0[weighted],
-            "F": np.array(F).reshape(-1, 10, 4, 4),
-            "variables": variables,
-        }
-        for name, array in arrays.items():
-            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)), persistent=False)
-
-    def forward(self, y: Tensor) -> Tensor:
-        value = (self.root @ y).square().sum() + self.linear @ y
-        if not len(self.F0):
-            return value
-        blocks = self.F0 + (y[self.variables][..., None, None] * self.F).sum(1)
-        return value - self.log_det_weight @ torch.linalg.eigvalsh(blocks).clamp_min(1e-300).log().sum(1)
 
 
 @dataclass(frozen=True)
@@ -129,10 +92,7 @@ class Loss(nn.Module):
         self._columns = batches.columns
         self._per_row = batches.samples / max(problem.rows, 1)
         self._processes = batches.share[1]
-        conic, terms = settings.conic_problem(problem), problem.terms
-        rows = min(len(problem.A) + (len(terms.C) if terms else 0), len(conic.linear))
-        self._prior = _Prior(conic, rows).to(batches.columns.device)
-        self._penalties = Penalties(settings, problem).to(batches.columns.device)
+        self._objective = Objective(settings, problem).to(batches.columns.device)
         self._beside = None if data is None else _difference(problem, data, batches.columns.device)
 
     def forward(self, batch: Batch, size: int | None = None) -> LossTerms:
@@ -150,9 +110,9 @@ class Loss(nn.Module):
         if self._beside is not None:
             losses["beside"] = of_one * self._beside(phi)
         if settings.ridge:
-            losses["prior"] = of_one * self._prior(self._scaled(phi))
+            losses["prior"] = of_one * self._objective.prior(self._scaled(phi))
         if settings.consistency == "penalties":
-            losses |= {name: of_one * x for name, x in self._penalties(self._scaled(phi)).items()}
+            losses |= {name: of_one * x for name, x in self._objective.penalties(self._scaled(phi)).items()}
         forces = {"rigid_body": rigid, "measured": batch.f}
         if other is not None:
             forces["residual"] = other
