@@ -22,7 +22,7 @@ _CHAINS = 512  # that find out how many passes make a state new
 _TRIES = (3, 6, 15)  # on an ellipse, at once, after which a chain stays where it is; each halves the arc
 _INSIDE = 1e-12  # least pivot of a block and slack of a row, relative to the mean's: above what rounding can hide
 _ALIKE = 0.25  # correlation of a coordinate with what it was, in all chains, below which states count as new
-_MOST_WHOLE, _MOST = 5, 200  # passes after which each kind of moves counts as too slow
+_MOST = 200  # passes after which moves of pairs count as too slow
 _BURN_IN = 4  # times as many passes as make states new, before the first is used
 _SHRINK, _SHRINKS = 0.8, 200  # of draws from the Gaussian that are outside, towards its mean
 _DIAGONAL = tuple(np.flatnonzero(UPPER[0] == UPPER[1]).tolist())
@@ -138,7 +138,8 @@ class EllipticalSlice(torch.nn.Module):
     def _measure(self) -> None:
         """Find out which moves it takes, and how many, until states are new."""
         generator = torch.Generator().manual_seed(0)
-        for self.moves, most in (("whole", _MOST_WHOLE), ("pairs", _MOST)):
+        for moves, most in (("whole", 5 + self._groups), ("pairs", _MOST)):  # a pass of pairs is as many moves
+            self.moves = moves
             state = self._start(_CHAINS, generator)
             for _ in range(2):
                 self._pass(state, generator)
