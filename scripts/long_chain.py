@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr, ndtri_exp
 
-from torchid.estimators.barrier import solve_barrier
-from torchid.estimators.conic_problem import ConicProblem
+from torchid.estimators.conic import ConicProblem, solve_barrier
 from torchid.parameters import Array
 
 

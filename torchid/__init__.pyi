@@ -42,11 +42,6 @@ from .fitting.calibration import (
     Calibration,
     calibrations,
 )
-from .fitting.cross_validation import (
-    RIDGES,
-    choose_ridge,
-    cross_validate,
-)
 from .fitting.factor_files import (
     FactorFile,
     RowModel,
@@ -58,6 +53,11 @@ from .fitting.factor_files import (
 from .fitting.fit import (
     LogFitter,
     frozen_parameters,
+)
+from .fitting.left_out import (
+    RIDGES,
+    choose_ridge,
+    cross_validate,
 )
 from .fitting.noise import (
     estimate_noise,

@@ -16,7 +16,7 @@ from synthetic import Array
 from torchid import parameters
 from torchid.estimators import Consistent
 from torchid.estimators.conditions import term_violations
-from torchid.estimators.conic_problem import Prior
+from torchid.estimators.conic import Prior
 from torchid.problem import LinearProblem
 from torchid.problem.linear import EliminatedTerms, SignCondition, parameter_scale
 

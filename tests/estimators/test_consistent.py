@@ -27,7 +27,7 @@ from synthetic import Array, transform
 from torchid import parameters
 from torchid.errors import InputError
 from torchid.estimators import Conditions, Consistent, violations
-from torchid.estimators.conic_problem import Prior
+from torchid.estimators.conic import Prior
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)

@@ -21,8 +21,7 @@ from scipy.optimize import nnls
 
 from torchid.errors import InputError, NumericalWarning
 from torchid.estimators import Conditions, Consistent, Enclosure, Mirror, violations
-from torchid.estimators.barrier import solve_barrier
-from torchid.estimators.conic_problem import Prior, build_conic_problem
+from torchid.estimators.conic import Prior, build_conic_problem, solve_barrier
 
 all_priors = pytest.mark.parametrize("prior", PRIORS)
 
@@ -125,7 +124,7 @@ def test_a_gap_is_as_small_as_was_asked_for_and_true(prior: Prior, tolerance: fl
 
 def test_a_solver_that_stops_short_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, _ = active_case(4)
-    monkeypatch.setattr("torchid.estimators.barrier._STEPS", 2)
+    monkeypatch.setattr("torchid.estimators.conic._STEPS", 2)
     with pytest.warns(NumericalWarning, match="stopped at a gap of"):
         estimate = Consistent(1e-3).solve(problem)
     assert estimate.gap > 1e-6 * estimate.objective

@@ -19,7 +19,7 @@ from synthetic import Array
 
 from torchid.errors import InputError
 from torchid.estimators import Conditions, Consistent, LeastSquares, violations
-from torchid.estimators.conic_problem import Prior
+from torchid.estimators.conic import Prior
 from torchid.problem import LinearProblem
 from torchid.problem.linear import parameter_scale
 

@@ -22,7 +22,7 @@ from torchid.estimators import (
     SgdEstimate,
     Trainer,
 )
-from torchid.estimators.conic_problem import Prior
+from torchid.estimators.conic import Prior
 from torchid.estimators.least_squares import FIXED, VERDICTS
 from torchid.problem import Batch, LinearProblem
 from torchid.problem.linear import parameter_scale

@@ -10,7 +10,7 @@ from physical import PRIORS, data, random_bodies, random_reflection
 from synthetic import Array
 
 from torchid.estimators import Conditions, Consistent, Mirror
-from torchid.estimators.conic_problem import Prior
+from torchid.estimators.conic import Prior
 from torchid.parameters import MASS, PER_BODY
 from torchid.problem import LinearProblem
 from torchid.problem.linear import EliminatedTerms, SignCondition, parameter_scale

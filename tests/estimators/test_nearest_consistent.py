@@ -25,7 +25,7 @@ from synthetic import Array
 
 from torchid.errors import InputError
 from torchid.estimators import Conditions, Mirror, nearest_consistent, violations
-from torchid.estimators.conic_problem import Prior
+from torchid.estimators.conic import Prior
 from torchid.estimators.consistent import _changeable
 from torchid.problem import LinearProblem
 

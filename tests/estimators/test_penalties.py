@@ -14,8 +14,8 @@ from synthetic import Array
 from torch import Tensor
 
 from torchid.estimators import PenaltyWeights
-from torchid.estimators.penalties import LEAST_LOGARITHM as LEAST
-from torchid.estimators.penalties import penalties
+from torchid.estimators.sgd import LEAST_LOGARITHM as LEAST
+from torchid.estimators.sgd import penalties
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)

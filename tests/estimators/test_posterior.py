@@ -12,9 +12,8 @@ from synthetic import Array
 from thinned import study_but
 
 from torchid.estimators import Conditions, LeastSquares, violations
-from torchid.estimators.barrier import barrier_gaussian
 from torchid.estimators.posterior import Posterior, whitened_rows
-from torchid.estimators.truncated_gaussian import TruncatedGaussian
+from torchid.estimators.truncated_gaussian import TruncatedGaussian, barrier_gaussian
 from torchid.problem import LinearProblem
 
 NONE = np.zeros(0)

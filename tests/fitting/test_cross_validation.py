@@ -15,12 +15,12 @@ from repository import DEMO
 import torchid
 from torchid.cli import main
 from torchid.config import load_config
-from torchid.fitting.cross_validation import (
+from torchid.fitting.experiment import Experiment, set_up, with_estimated_noise
+from torchid.fitting.left_out import (
+    RIDGE,
     RIDGES,
     STRONGER,
 )
-from torchid.fitting.experiment import Experiment, set_up, with_estimated_noise
-from torchid.fitting.left_out import RIDGE
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from synthetic import SOLO12, Oracle, load, make_log
 
-from torchid.fitting.cross_validation import with_all_readings
+from torchid.fitting.left_out import with_all_readings
 from torchid.problem import RowBuilder, bind_log
 from torchid.sensing import Contact, named_sensors
 

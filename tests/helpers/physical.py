@@ -10,7 +10,7 @@ from synthetic import Array
 
 from torchid import parameters
 from torchid.estimators import Conditions, Enclosure, Mirror
-from torchid.estimators.conic_problem import Prior
+from torchid.estimators.conic import Prior
 from torchid.problem import LinearProblem
 from torchid.problem.linear import parameter_scale
 

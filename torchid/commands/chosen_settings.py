@@ -17,12 +17,12 @@ from torchid import distributed
 from torchid.commands.check import recorded_segments
 from torchid.errors import InputError, TorchidWarning, join_names
 from torchid.estimators import Conditions
-from torchid.fitting.cross_validation import RidgeChoice
 from torchid.fitting.experiment import Experiment, RobotSetup, S, with_radius
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.left_out import (
     TERMS,
     Reading,
+    RidgeChoice,
     TermsChoice,
     block_edges,
     choose_terms,

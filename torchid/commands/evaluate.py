@@ -20,8 +20,8 @@ from torchid.config import load_config
 from torchid.config.robot import NoiseConfig
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
-from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, require_device, set_up, stated_noise, with_estimated_noise
+from torchid.fitting.left_out import Scorer
 from torchid.fitting.posterior import RESIDUAL, RigidPlusResidual
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import log_title, split_range

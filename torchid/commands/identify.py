@@ -24,11 +24,10 @@ from torchid.errors import ConfigError, NumericalWarning, warn_about_file
 from torchid.estimators import Estimate, violations
 from torchid.estimators.conditions import term_violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_masked
-from torchid.fitting.cross_validation import Scorer, TrainingScore, calibrations_without_folds
 from torchid.fitting.experiment import Experiment, set_up, with_noise, with_task_weights
 from torchid.fitting.factor_files import FactorFile, read_fleet
 from torchid.fitting.fit import Fit, LogFitter
-from torchid.fitting.left_out import gain_deviations
+from torchid.fitting.left_out import Scorer, TrainingScore, calibrations_without_folds, gain_deviations
 from torchid.fitting.noise import NoiseSummary, misfit, resting_joints, unfitted_friction
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly

@@ -17,7 +17,7 @@ from torchid.commands.chosen_settings import Choices
 from torchid.errors import UnknownNameError
 from torchid.estimators import Estimate, Violation
 from torchid.fitting.calibration import Comparison
-from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
+from torchid.fitting.left_out import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.noise import Misfit, NoiseSummary

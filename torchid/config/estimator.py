@@ -12,7 +12,7 @@ from torchid.config.robot import PerAxis, PerJoint
 from torchid.errors import ConfigError
 from torchid.estimators import Conditions, Consistent, LeastSquares, PenaltyWeights, Sgd, TrainingSettings
 from torchid.estimators.conditions import EnclosureKind
-from torchid.estimators.conic_problem import Prior
+from torchid.estimators.conic import Prior
 from torchid.estimators.sgd import Consistency
 from torchid.settings import (
     AUTO,

@@ -3,11 +3,11 @@
 from torchid.estimators.conditions import Conditions, Enclosure, Mirror, Violation, violations
 from torchid.estimators.consistent import Consistent, ConsistentEstimate, nearest_consistent
 from torchid.estimators.least_squares import ConstrainedEstimate, Estimate, LeastSquares
-from torchid.estimators.penalties import PenaltyWeights
 from torchid.estimators.sgd import (
     FreeParameters,
     LearnableParameters,
     LogCholeskyParameters,
+    PenaltyWeights,
     Sgd,
     TrainingSettings,
 )

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from torchid import parameters
-from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions, validate_parameters, violations
-from torchid.estimators.conic_problem import ConicProblem, Prior, Solution, build_conic_problem
+from torchid.estimators.conic import ConicProblem, Prior, Solution, build_conic_problem, solve_barrier
 from torchid.estimators.least_squares import ConstrainedEstimate, Minimizer, Regularized, report_rounding
 from torchid.parallel import one_thread
 from torchid.parameters import PER_BODY, Array

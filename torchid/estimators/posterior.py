@@ -10,7 +10,7 @@ from scipy.special import chdtri
 
 from torchid import parameters
 from torchid.estimators.conditions import Conditions
-from torchid.estimators.conic_problem import ConicProblem, build_conic_problem
+from torchid.estimators.conic import ConicProblem, build_conic_problem
 from torchid.parallel import one_thread
 from torchid.parameters import FRICTION, INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem

@@ -19,17 +19,15 @@ from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 
 from torchid import parameters
 from torchid.errors import InputError, NumericalWarning, UnknownNameError
-from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions
-from torchid.estimators.conic_problem import ConicProblem, Prior, build_conic_problem
+from torchid.estimators.conic import ConicProblem, Prior, build_conic_problem, solve_barrier
 from torchid.estimators.consistent import Consistent
 from torchid.estimators.least_squares import Minimizer, Regularized
-from torchid.estimators.penalties import PenaltyWeights, penalties
 from torchid.parallel import one_thread
 from torchid.parameters import INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.reprs import short_repr
-from torchid.settings import Count, NamedClass, NotNegative, Positive
+from torchid.settings import Count, NamedClass, NotNegative, Positive, validate_settings
 
 Group = dict[str, Any]
 
@@ -307,6 +305,61 @@ class LogCholeskyParameters(LearnableParameters):
         inertial, frictional = self.get_buffer("_inertial"), self.get_buffer("_frictional")
         phi = self.nominal.masked_scatter(inertial, ten.flatten() * self.scale[inertial])
         return phi.masked_scatter(frictional, friction * self.scale[frictional])
+
+
+LEAST_LOGARITHM = 1e-4
+"""Eigenvalue above the margin below which the barrier goes on as the tangent of its logarithm."""
+
+
+@dataclass(frozen=True)
+class PenaltyWeights:
+    """Weights of the penalties beside the mean squared whitened residual.
+
+    Attributes:
+        eigenvalue: squares of the shortfall of scaled pseudo-inertias' eigenvalues from the margin.
+        log_det: minus the logarithms of these eigenvalues less the margin, a barrier.
+        mass: squares of negative masses, in units of their scale.
+        friction: squares of negative friction, in units of its scale.
+    """
+
+    eigenvalue: NotNegative = 10.0
+    log_det: NotNegative = 0.0
+    mass: NotNegative = 10.0
+    friction: NotNegative = 10.0
+
+    def __post_init__(self) -> None:
+        validate_settings(self)
+
+    @property
+    def curvature(self) -> float:
+        """Bound of the second derivatives, in units of the scale; off-diagonal entries of a matrix count twice."""
+        return 2.0 * (2.0 * self.eigenvalue + self.mass + self.friction)
+
+
+def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWeights) -> dict[str, Tensor]:
+    """Weighted penalties by name; those of weight 0 are left out.
+
+    Args:
+        scaled: (L, 12), parameters in units of their scale.
+        bodies: (L',) int, bodies whose inertia is penalized; friction is penalized for all.
+        margin: least eigenvalue without a penalty.
+        weights: of the terms.
+    """
+    out: dict[str, Tensor] = {}
+    if weights.eigenvalue or weights.log_det:
+        basis = torch.from_numpy(parameters.PSEUDO_BASIS).to(scaled)
+        eigenvalues = torch.linalg.eigvalsh(torch.tensordot(scaled[bodies][:, parameters.INERTIAL], basis, dims=1))
+        if weights.eigenvalue:
+            out["eigenvalue"] = weights.eigenvalue * (margin - eigenvalues).clamp_min(0.0).square().sum()
+        if weights.log_det:
+            above = eigenvalues - margin
+            inside = above.clamp_min(LEAST_LOGARITHM)
+            out["log_det"] = -weights.log_det * (inside.log() + (above - inside) / LEAST_LOGARITHM).sum()
+    if weights.mass:
+        out["mass"] = weights.mass * scaled[bodies, parameters.MASS].clamp_max(0.0).square().sum()
+    if weights.friction:
+        out["friction"] = weights.friction * scaled[:, parameters.FRICTION].clamp_max(0.0).square().sum()
+    return out
 
 
 Consistency = Literal["log_cholesky", "penalties"]

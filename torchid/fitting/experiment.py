@@ -27,9 +27,8 @@ from torchid.errors import (
 )
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
-from torchid.fitting.cross_validation import RIDGES, STRONGER, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
-from torchid.fitting.left_out import RIDGE
+from torchid.fitting.left_out import RIDGE, RIDGES, STRONGER, RidgeChoice, choose_ridge
 from torchid.fitting.noise import NoiseSummary, estimate_noise, mean_noise_square, recorded_sensors
 from torchid.fitting.prior_knowledge import conditions_from, known_masses
 from torchid.fitting.robust import RobustLoss

@@ -22,7 +22,7 @@ from torchid.errors import format_percent
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import FIXED, IDENTIFIED
 from torchid.fitting.calibration import Comparison
-from torchid.fitting.cross_validation import RidgeChoice
+from torchid.fitting.left_out import RidgeChoice
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.logs.time_range import log_title
 from torchid.parameters import INERTIAL, PARAMETERS, PER_BODY, WRENCH_COMPONENTS, Array
