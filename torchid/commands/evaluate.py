@@ -246,12 +246,12 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
     scorer = Scorer(evaluation, compared.identified.builder)
     metrics, with_residual, learned = {}, {}, fitted.learned
     for log in samples:
-        pair = scorer.score_logs([log], compared, lambda n: bars.advance(evaluating, n))
+        pair = Comparison(*scorer.score([log], {log.fold: compared}, progress=lambda n: bars.advance(evaluating, n)))
         metrics[split_range(log.source).name] = pair
         if learned is not None:
             own = replace(compared.identified, phi=learned.phi.numpy())
-            freed = [learned.without_residual(log)]
-            with_residual[split_range(log.source).name] = scorer.score_logs(freed, Comparison(own, own)).identified
+            freed = learned.without_residual(log)
+            (with_residual[split_range(log.source).name],) = scorer.score([freed], {log.fold: [own]})
         if not any(x is not None for x in pair.identified.rms.values()):
             warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
     excluded = {split_range(path).name: count for path, count in reader.excluded.items()}

@@ -27,7 +27,7 @@ from torchid.fitting.calibration import Calibration, Comparison, warn_of_confoun
 from torchid.fitting.experiment import Experiment, set_up, with_noise, with_task_weights
 from torchid.fitting.factor_files import FactorFile, read_fleet
 from torchid.fitting.fit import Fit, LogFitter
-from torchid.fitting.left_out import Scorer, TrainingScore, calibrations_without_folds, gain_deviations
+from torchid.fitting.left_out import CrossValidation, Scorer, calibrations_without_folds, gain_deviations
 from torchid.fitting.noise import NoiseSummary, misfit, resting_joints, unfitted_friction
 from torchid.fitting.posterior import fitted_posterior
 from torchid.fitting.robust import RobustSummary, fit_robustly
@@ -119,7 +119,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         by_state, added = _identifiability(fit, fitter, data, bars)
     with clock("evaluate"):
         scorer = Scorer(evaluation, builder)
-        train, metrics, evaluated = _errors(scorer, fit, fitter, compared, data, bars)
+        held_out, metrics, evaluated = _errors(scorer, fit, fitter, compared, data, bars)
         traces = distributed.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
         friction = unfitted_friction(problem, experiment.robot)
 
@@ -147,7 +147,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         excluded=data.excluded,
         mass=mass,
         posterior=fitted_posterior(fit, experiment.robot, conditions),
-        validation=train.cross_validation,
+        validation=held_out,
         ridge=ridge,
         choices=with_sample_rates(data.choices, experiment, logs["train"]),
         forces=next(iter(forces), None),
@@ -215,19 +215,17 @@ def _errors(
     compared: Comparison[Calibration],
     data: TrainingData,
     bars: Progress,
-) -> tuple[TrainingScore, dict[str, Comparison[Metrics]], dict[str, int]]:
-    """Errors on the training logs, with cross-validation, and by set of logs, with the number of samples of each."""
+) -> tuple[CrossValidation | None, dict[str, Comparison[Metrics]], dict[str, int]]:
+    """Errors of cross-validation, and by set of logs, with the number of samples whose forces were predicted."""
     test, without_folds = data.logs["test"], calibrations_without_folds(fit, fitter)
-    unseen = sum(map(len, test))
-    done = partial(bars.advance, bars.add_task("evaluating", total=scorer.scored(data.blocks)[1] + unseen))
+    evaluated = {"train": scorer.scored(data.blocks)[1], "test": sum(map(len, test))}
+    done = partial(bars.advance, bars.add_task("evaluating", total=sum(evaluated.values())))
     parts = merge(fit.parts, fitter.builder, *BY_FOLD)
-    train = scorer.score_training(data.blocks, parts, compared, without_folds, done)
-    metrics: dict[str, Comparison[Metrics]] = {"train": train.metrics}
-    evaluated = {"train": train.samples}
+    train, held_out = scorer.score_training(data.blocks, parts, compared, without_folds, done)
+    metrics = {"train": train}
     if test:
-        metrics["test"] = scorer.score_logs(test, compared, done)
-        evaluated["test"] = unseen
-    return train, metrics, evaluated
+        metrics["test"] = Comparison(*scorer.score(test, {log.fold: compared for log in test}, progress=done))
+    return held_out, metrics, {name: evaluated[name] for name in metrics}
 
 
 # ------------------------------------------------------------------------------------------------------- what is fitted

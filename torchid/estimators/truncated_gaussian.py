@@ -228,9 +228,9 @@ class EllipticalSlice(torch.nn.Module):
         for name, array in arrays.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)))
         self._groups = 0
-        for variables in _pairs(gaussian, owners):
+        for variables in (np.arange(len(owners)), *_pairs(gaussian, owners)):
             self._add_group(gaussian, conic.E, variables)
-        self.moves, self.passes = "whole", 1
+        self.moved, self.passes = 1, 1  # groups that move in a pass, the first one all variables together
         self._measure()
 
     def _add_group(self, gaussian: BarrierGaussian, E: Array, variables: np.ndarray) -> None:
@@ -263,8 +263,8 @@ class EllipticalSlice(torch.nn.Module):
     def _measure(self) -> None:
         """Find out which moves it takes, and how many, until states are new."""
         generator = torch.Generator().manual_seed(0)
-        for moves, most in (("whole", 5 + self._groups), ("pairs", _MOST)):  # a pass of pairs is as many moves
-            self.moves = moves
+        for moved, most in ((1, 5 + self._groups), (self._groups, _MOST)):  # a pass of pairs is as many moves
+            self.moved = moved
             state = self._start(_CHAINS, generator)
             for _ in range(2):
                 self._pass(state, generator)
@@ -292,23 +292,17 @@ class EllipticalSlice(torch.nn.Module):
         return self._at(torch.zeros_like(x))
 
     def _at(self, x: Tensor) -> _State:
-        return _State(x, self.root @ x if self.moves != "whole" else x, *self._changes(x))
-
-    def _changes(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the entries of blocks, (K, 10, B), and of rows, (M, B), by x, (n, B)."""
-        return self.block_changes @ x[self.block_variables], self.row_changes @ x
+        return _State(x, self.root @ x, self.block_changes @ x[self.block_variables], self.row_changes @ x)
 
     def _pass(self, state: _State, generator: torch.Generator | None) -> None:
-        """One move of all variables, together, or one part after the other while the others rest."""
-        if self.moves != "whole":
-            for number in range(self._groups):
-                self._move_group(state, self._group(number), generator)
-        self._move_all(state, generator)
+        """One move of all variables together, or of one pair of bodies after the other while the others rest."""
+        for number in reversed(range(min(self.moved, self._groups))):
+            self._move(state, self._group(number), generator)
 
     def _group(self, number: int) -> _Group:
         return _Group(*(getattr(self, f"{name}_{number}") for name in _Group.__annotations__))
 
-    def _move_group(self, state: _State, group: _Group, generator: torch.Generator | None) -> None:
+    def _move(self, state: _State, group: _Group, generator: torch.Generator | None) -> None:
         centre = -(group.basis.T @ state.whitened)  # of y, which is 0 at the state
         drawn = torch.randn(centre.shape, dtype=torch.float64, device=centre.device, generator=generator)
         blocks, rows = state.blocks[group.blocks], state.rows[group.rows]
@@ -323,20 +317,6 @@ class EllipticalSlice(torch.nn.Module):
         state.whitened += group.basis @ y
         state.blocks[group.blocks] += changed[:cut].view(-1, 10, changed.shape[1])
         state.rows[group.rows] += changed[cut:]
-
-    def _move_all(self, state: _State, generator: torch.Generator | None) -> None:
-        size = (self.directions.shape[1], state.x.shape[1])
-        drawn = torch.randn(size, dtype=torch.float64, device=self.mean.device, generator=generator)
-        x = self.directions @ drawn
-        blocks, rows = self._changes(x)
-        now, across = (torch.cat([b.flatten(0, 1), r]) for b, r in ((state.blocks, state.rows), (blocks, rows)))
-        near = self.near[: len(blocks)], self.near[len(blocks) :]
-        angle = self._angle((now, -now, across), 10 * len(blocks), near, generator)
-        cosine, sine = torch.cos(angle), torch.sin(angle)
-        for old, new in ((state.x, x), (state.blocks, blocks), (state.rows, rows)):
-            old.mul_(cosine).addcmul_(new, sine)
-        if self.moves != "whole":
-            state.whitened = self.root @ state.x
 
     def _angle(
         self,

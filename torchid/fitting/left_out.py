@@ -522,7 +522,7 @@ def cross_validate(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms
     if not compared:
         raise _too_few(logs)
     scorer = Scorer(Evaluation(fitter.robot, builder.contacts, str(builder.device), terms), builder)
-    scores = scorer.score_by_fold(blocks, merge(problem.parts, builder, *BY_FOLD), dict(enumerate(compared)))
+    scores = scorer.score(blocks, dict(enumerate(compared)), merge(problem.parts, builder, *BY_FOLD))
     return CrossValidation(len(compared), *scores)
 
 
@@ -629,18 +629,6 @@ def _too_few(logs: Sequence[Block]) -> LogError:
 
 
 @dataclass(frozen=True)
-class TrainingScore:
-    """Errors of a fit on its training logs, and of cross-validation, None where there is only one fold.
-
-    `samples`: number of those whose forces were predicted; the whitened projected residual is that of all samples.
-    """
-
-    metrics: Comparison[Metrics]
-    cross_validation: CrossValidation | None
-    samples: int
-
-
-@dataclass(frozen=True)
 class Scorer:
     """Errors of parameters on logs: `evaluation` predicts forces, `builder` makes the rows of a fit.
 
@@ -660,17 +648,36 @@ class Scorer:
             step += 1  # each log has a first sample
         return step, sum(-(-length // step) for length in lengths)
 
-    def score_logs(
-        self, logs: Sequence[Samples], compared: Comparison[Calibration], progress: ProgressCallback | None = None
-    ) -> Comparison[Metrics]:
-        """Errors on logs as recorded, each with the extra parameters that fit the bodies' parameters best.
+    def score(
+        self,
+        logs: Sequence[Block],
+        compared: Mapping[int, Sequence[Calibration]],
+        parts: Sequence[Part] | None = None,
+        progress: ProgressCallback | None = None,
+    ) -> list[Metrics]:
+        """Errors on logs of some parameters, each with the extra parameters that fit them best.
 
-        Rows of the fit's sensors count where a log has all their readings.
+        Args:
+            logs: bound; compressed ones give only the whitened projected residual.
+            compared: parameters for the logs of each fold.
+            parts: training logs, compressed with the weights of the fit: every k-th sample of them is evaluated; None
+                for logs as recorded, of which rows of the fit's sensors count where a log has all their readings.
+            progress: called with the number of samples done.
         """
-        pairs = self._force_sums(logs, {log.fold: compared for log in logs} or {0: compared}, progress, 1)
-        whole = [with_all_readings(replace(log, motion_noise=None), self.builder) for log in logs]
-        _add_squares(pairs, sum_residuals(self.builder, whole, compress_parts(whole, self.builder), compared))
-        return Comparison(*(self.evaluation.summarize(*pair) for pair in pairs))
+        whole = [log for log in logs if isinstance(log, Samples)]
+        pairs = self._force_sums(whole, compared, progress, 1 if parts is None else self.scored(logs)[0])
+        if parts is None:
+            whole = [with_all_readings(replace(log, motion_noise=None), self.builder) for log in whole]
+            parts = compress_parts(whole, self.builder)
+        for fold, calibrations in compared.items():
+            logs_of_fold = [log for log in logs if log.fold == fold]
+            parts_of_fold = [part for part in parts if part.fold == fold]
+            squares = sum_residuals(self.builder, logs_of_fold, parts_of_fold, calibrations)
+            for (measured, error), sums in zip(pairs, squares, strict=True):
+                measured.whitened.add_squares(sums.measured, sums.rows)
+                error.whitened.add_squares(sums.error, sums.rows)
+                measured.whitened_noise.add_squares(sums.noise, sums.rows)
+        return [self.evaluation.summarize(*pair) for pair in pairs]
 
     def score_training(
         self,
@@ -679,15 +686,12 @@ class Scorer:
         compared: Comparison[Calibration],
         without_folds: Sequence[Comparison[Calibration]],
         progress: ProgressCallback | None = None,
-    ) -> TrainingScore:
+    ) -> tuple[Comparison[Metrics], CrossValidation | None]:
         """Errors of the fit on the training logs, and of fits without a fold each on that fold, in one pass.
 
-        Of many samples every k-th is evaluated; the whitened projected residual comes from all.
-
         Args:
-            logs: as `split_into_folds` or `fold_compressed` has cut them; compressed ones give only the whitened
-                projected residual.
-            parts: compressed, with the weights of a robust fit.
+            logs: as `split_into_folds` or `fold_compressed` has cut them.
+            parts: as of `score`.
             compared: parameters of the fit.
             without_folds: those of a fit without each fold, by its number; none without cross-validation.
             progress: called with the number of samples done, of those that are `scored`.
@@ -697,25 +701,10 @@ class Scorer:
             fold: [*compared, *(without_folds[fold][first:] if without_folds else ())]
             for fold in sorted({log.fold for log in logs})
         }
-        metrics = self.score_by_fold(logs, parts, by_fold, progress)
+        metrics = self.score(logs, by_fold, parts, progress)
         count = len(without_folds)
         held_out = CrossValidation(count, metrics[0 if first else 2], metrics[-1]) if count else None
-        return TrainingScore(Comparison(*metrics[:2]), held_out, self.scored(logs)[1])
-
-    def score_by_fold(
-        self,
-        logs: Sequence[Block],
-        parts: Sequence[Part],
-        compared: Mapping[int, Sequence[Calibration]],
-        progress: ProgressCallback | None = None,
-    ) -> list[Metrics]:
-        """Errors of some parameters each on one fold of the training logs; arguments as `score_training`."""
-        whole, step = [log for log in logs if isinstance(log, Samples)], self.scored(logs)[0]
-        pairs = self._force_sums(whole, compared, progress, step)
-        for fold, of_fold in compared.items():
-            own = [log for log in logs if log.fold == fold], [part for part in parts if part.fold == fold]
-            _add_squares(pairs, sum_residuals(self.builder, *own, of_fold))
-        return [self.evaluation.summarize(*pair) for pair in pairs]
+        return Comparison(*metrics[:2]), held_out
 
     def _force_sums(
         self,
@@ -746,11 +735,3 @@ class Scorer:
             measured, error = self.evaluation.force_sums(readings, of_one, progress if identified else None)
             pairs.append((measured, error))
         return pairs
-
-
-def _add_squares(pairs: Sequence[tuple[ForceSums, ForceSums]], squares: Sequence[ResidualSquares]) -> None:
-    """Add the rows of a fit to the sums of measured forces and of errors, for each calibration."""
-    for (measured, error), own in zip(pairs, squares, strict=True):
-        for sums, square in ((measured, own.measured), (error, own.error)):
-            sums.whitened.add_squares(square, own.rows)
-        measured.whitened_noise.add_squares(own.noise, own.rows)
