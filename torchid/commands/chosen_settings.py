@@ -125,7 +125,8 @@ def with_chosen_settings(setup: S, bars: Progress) -> tuple[S, Choices]:
     """
     if setup.config.logs is None or setup.config.logs.compressed:
         return setup, Choices()
-    choices, trials = Choices(), _Trials()
+    choices = Choices()
+    trials = _Trials()
     setup = _with_chosen_data(setup, choices, trials, bars)
     setup = _with_chosen_terms(setup, choices, trials, bars)
     return _with_actuators(setup, **setup.config.actuators.known), choices
@@ -133,7 +134,8 @@ def with_chosen_settings(setup: S, bars: Progress) -> tuple[S, Choices]:
 
 def _with_chosen_data(setup: S, choices: Choices, trials: _Trials, bars: Progress) -> S:
     """The setup with the band and the samples that are fitted, and the tilt of the base."""
-    finds_cutoff, shortest = setup.config.preprocessing.cutoff_hz == AUTO, 0.0
+    finds_cutoff = setup.config.preprocessing.cutoff_hz == AUTO
+    shortest = 0.0
     if finds_cutoff:
         choices.cutoff, shortest = _chosen("cutoff", partial(_cutoff_of_motion, setup), bars)
         setup = _with_preprocessing(setup, cutoff_hz=choices.cutoff.cutoff_hz)
@@ -233,7 +235,8 @@ class _Trials:
         setup = _with_actuators(setup, **{name: True for name in names if name != "delay"})
         logs, fitter = self.logs_and_fitter(setup, estimate_noise)
         self._edges = self._edges or block_edges(logs)
-        terms, gain = replace(setup.terms, slope="delay" in names), setup.config.sensors.gain_error
+        terms = replace(setup.terms, slope="delay" in names)
+        gain = setup.config.sensors.gain_error
         if gain and self.measures_torques(setup) and "joint_torque" not in terms.scales:
             terms = replace(terms, scales={**terms.scales, "joint_torque": "all"})
         else:
@@ -258,7 +261,8 @@ class _Trials:
 
     def _read(self, setup: RobotSetup) -> tuple[list[Samples], SensorSet]:
         """The logs and the sensors of their rows, all that were recorded where the setup states none."""
-        sensors, files = setup.sensors if isinstance(setup, Experiment) else None, setup.config.logs
+        sensors = setup.sensors if isinstance(setup, Experiment) else None
+        files = setup.config.logs
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TorchidWarning)  # said where the logs are read for the fit
             logs = _TrialReader(setup, self._recorded).read(files.train if files else [], sensors)
@@ -284,7 +288,8 @@ def needs_these_torques(setup: RobotSetup) -> bool:
 
 def lower_cutoff(setup: RobotSetup) -> CutoffChoice | None:
     """The band that a fit predicts, None where it is not narrower than the one that is fitted, or not known."""
-    files, cutoff = setup.config.logs, setup.config.preprocessing.filter_hz
+    files = setup.config.logs
+    cutoff = setup.config.preprocessing.filter_hz
     if files is None or files.compressed or cutoff is None:
         return None
     with suppress(InputError):
@@ -340,7 +345,8 @@ def with_sample_rates(choices: Choices, setup: RobotSetup, logs: Sequence[Sample
 
 def _cutoff(setup: RobotSetup, trials: _Trials, limit: CutoffChoice, shortest: float) -> CutoffChoice:
     """The widest band that the model predicts, up to a limit; `shortest`: how long the shortest log is [s]."""
-    widest_hz, lowest_hz = setup.config.preprocessing.filter_hz or 0.0, max(_LOWEST_HZ, _PERIODS / shortest)
+    widest_hz = setup.config.preprocessing.filter_hz or 0.0
+    lowest_hz = max(_LOWEST_HZ, _PERIODS / shortest)
     tried = [widest_hz / 2**k for k in range(_OCTAVES) if not k or widest_hz / 2**k >= lowest_hz]
     setups = {cutoff: _with_preprocessing(setup, cutoff_hz=cutoff) for cutoff in tried}
     found = _data(setups, trials, estimate_noise=True).value
@@ -365,16 +371,17 @@ def _radius(setup: RobotSetup, trials: _Trials) -> Profile:
 
 def _cutoff_of_motion(setup: RobotSetup) -> tuple[CutoffChoice, float]:
     """By the middle of each training log, and how long the shortest of them is [s]."""
-    settings, files = setup.config.preprocessing, setup.config.logs
+    settings = setup.config.preprocessing
+    files = setup.config.logs
     if files is None:
         return CutoffChoice(None, by_noise=False), 0.0
     with files_of_recordings_kept():
         logs = [next(recorded_segments(path, files, settings)).log for path in files.train]
-    stated, from_feet = setup.config.sensors.noise.motion, settings.base_motion is not None
+    from_feet = settings.base_motion is not None
     rate = None if settings.sample_rate_hz == AUTO else settings.sample_rate_hz
     shortest = min(float(log.time[-1] - log.time[0]) for log in logs)
     logs = [new_poses(log) for log in logs]  # whose rate bounds the band, not that of a file which repeats them
-    return choose_cutoff(logs, stated, rate, base_is_derived=from_feet), shortest
+    return choose_cutoff(logs, setup.config.sensors.noise.motion, rate, base_is_derived=from_feet), shortest
 
 
 def _with_preprocessing(setup: S, **stated: Any) -> S:

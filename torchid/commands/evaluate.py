@@ -172,7 +172,8 @@ def evaluate(
     """
     folder = Path(run)
     require_run(folder)
-    given, replaces = None if output is None else Path(output), output is None or overwrite
+    given = None if output is None else Path(output)
+    replaces = output is None or overwrite
     place = _output(folder, logs, given, replaces) if write else None
     with progress_bars() as bars:
         fitted = read_run(folder, device)
@@ -203,7 +204,8 @@ def read_run(folder: Path, device: str | None = None) -> FittedRun:
         InputError: it is no run, or does not fit its robot any more.
     """
     require_run(folder)
-    settings, found = folder / _SETTINGS, folder / "parameters.json"
+    settings = folder / _SETTINGS
+    found = folder / "parameters.json"
     config = load_config(settings, [f"device={device}"] if device else [], reads_logs=False)
     with about_file(settings):
         experiment, usual, explained = _with_own_metrics(set_up(config), folder / _METRICS)
@@ -236,7 +238,8 @@ def evaluate_identification(run: Identification, logs: Sequence[str | Path], dev
 
 def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None, bars: Progress) -> EvaluatedRun:
     """Errors of what a run has found; `folder`: on whose disk large logs are kept."""
-    experiment, compared = fitted.experiment, fitted.calibrations
+    experiment = fitted.experiment
+    compared = fitted.calibrations
     _log_names(logs)
     evaluation = experiment.evaluation(experiment.noise_of_readings)
     reading = bars.add_task("reading logs", total=len(logs))
@@ -244,7 +247,9 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
     samples = reader.read([Path(log) for log in logs], None, lambda _: bars.advance(reading))
     evaluating = bars.add_task("evaluating", total=sum(map(len, samples)))
     scorer = Scorer(evaluation, compared.identified.builder)
-    metrics, with_residual, learned = {}, {}, fitted.learned
+    metrics = {}
+    with_residual = {}
+    learned = fitted.learned
     for log in samples:
         pair = Comparison(*scorer.score([log], {log.fold: compared}, progress=lambda n: bars.advance(evaluating, n)))
         metrics[split_range(log.source).name] = pair
@@ -270,7 +275,8 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
 
 def _calibrations(experiment: Experiment, phi: Array, shared: Comparison[dict[str, float]]) -> Comparison[Calibration]:
     """Nominal and identified parameters (L, 12), each with the extra parameters of all logs, by label."""
-    robot, builder = experiment.robot, experiment.builder(experiment.sensors)
+    robot = experiment.robot
+    builder = experiment.builder(experiment.sensors)
     nominal, identified = (
         Calibration(
             robot=robot,
@@ -359,7 +365,8 @@ def compare_forces(evaluation: Evaluation, samples: Samples, compared: Compariso
 
     Each prediction is as far from what was measured as from readings that are calibrated for it.
     """
-    measured, predicted = [], []
+    measured = []
+    predicted = []
     for one in compared:
         (read,) = one.calibrate([samples])
         part = read[:_SAMPLES]
@@ -379,7 +386,8 @@ def compare_forces(evaluation: Evaluation, samples: Samples, compared: Compariso
 def trace_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> LogForces:
     """Forces of a whole log in the rows of the fit; of a long log every k-th sample."""
     step = max(1, -(-len(samples) // _TRACED))
-    part, builder = samples.every(step), compared.identified.builder
+    part = samples.every(step)
+    builder = compared.identified.builder
     projected = projected_forces(builder, part, torch.stack([one.columns(builder, samples) for one in compared]))
     present = list(dict.fromkeys(map(tuple, part.active.tolist())))
     names = {state: state_name(builder.contacts, state) for state in present}

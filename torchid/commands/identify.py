@@ -96,14 +96,17 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         if config.estimator.name == "sgd":
             descent_settings(config)  # before any work
     data = (_data_of_factors if config.logs.compressed else _data_of_logs)(experiment, clock, bars)
-    logs, builder = data.logs, data.builder
+    logs = data.logs
+    builder = data.builder
     with clock("ridge"):
         experiment, ridge = with_ridge(data.experiment, data.parts, data.blocks, builder, conditions, bars)
-    fitter, checked = experiment.fitter(builder, conditions), TrainingLogs(experiment, bars)
+    fitter = experiment.fitter(builder, conditions)
+    checked = TrainingLogs(experiment, bars)
     evaluation = experiment.evaluation(experiment.noise_of_readings)
 
     with clock("solve"):
-        training, solve = None, None
+        training = None
+        solve = None
         if config.estimator.name == "sgd":
             require_plausible(fitter.fit(data.parts), checked)
             training = Training(experiment)
@@ -112,7 +115,8 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         fit, robust = _robust(fitter.fit(data.parts, solve), data, fitter, bars)
         fit, mass = _judged(fit, fitter, data, checked)
         data.parts = []
-        problem, compared = fit.assembly.problem, experiment.calibrations(fit, builder)
+        problem = fit.assembly.problem
+        compared = experiment.calibrations(fit, builder)
         shown = [*logs["test"], *logs["train"]][:1]
         forces = distributed.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
     with clock("identifiability"):
@@ -166,7 +170,8 @@ def _judged(fit: Fit, fitter: LogFitter, data: TrainingData, checked: TrainingLo
         ImplausibleFitError: no robot can have left it.
         ConfigError: task weights, with logs too short for the intervals that know of these.
     """
-    experiment, train = data.experiment, data.logs["train"]
+    experiment = data.experiment
+    train = data.logs["train"]
     gains = distributed.from_first(
         partial(gain_deviations, train, fitter, experiment.terms, experiment.config.sensors.gain_error), "gains"
     )
@@ -185,7 +190,7 @@ def _identifiability(
     fit: Fit, fitter: LogFitter, data: TrainingData, bars: Progress
 ) -> tuple[dict[str, Estimate], Contributions]:
     """What each contact state determines on its own, most frequent first, and what each log, state and sensor adds."""
-    builder, robot = fitter.builder, fitter.robot
+    builder = fitter.builder
     parts = fit.parts
     if data.factors:  # by contact state
         parts = [*(part for x in data.factors for part in x.log.by_state), *(x for x in parts if x.unloaded)]
@@ -198,10 +203,11 @@ def _identifiability(
         problem = fitter.assemble([part for part in whole if part.state == state]).problem
         by_state[state_name(builder.contacts, state)] = fitter.least_squares.solve(problem)
     bar = bars.add_task("leaving out each in turn", total=None)
-    problem, tolerance = fit.assembly.problem, fitter.estimator.rank_tolerance
+    problem = fit.assembly.problem
+    tolerance = fitter.estimator.rank_tolerance
     done = partial(bars.advance, bar)
     added = distributed.from_first(
-        lambda: contributions(whole, data.logs["train"], builder, problem, robot.dof_names, tolerance, done),
+        lambda: contributions(whole, data.logs["train"], builder, problem, fitter.robot.dof_names, tolerance, done),
         "contributions",
     )
     bars.update(bar, total=1, completed=1)
@@ -217,7 +223,8 @@ def _errors(
     bars: Progress,
 ) -> tuple[CrossValidation | None, dict[str, Comparison[Metrics]], dict[str, int]]:
     """Errors of cross-validation, and by set of logs, with the number of samples whose forces were predicted."""
-    test, without_folds = data.logs["test"], calibrations_without_folds(fit, fitter)
+    test = data.logs["test"]
+    without_folds = calibrations_without_folds(fit, fitter)
     evaluated = {"train": scorer.scored(data.blocks)[1], "test": sum(map(len, test))}
     done = partial(bars.advance, bars.add_task("evaluating", total=sum(evaluated.values())))
     parts = merge(fit.parts, fitter.builder, *BY_FOLD)
@@ -314,7 +321,8 @@ def _read(experiment: Experiment, bars: Progress) -> tuple[dict[str, list[Sample
 
     Those that are trained on, or decide when to stop, have every sensor of the set.
     """
-    reader, settings = LogReader(experiment), experiment.config.logs
+    reader = LogReader(experiment)
+    settings = experiment.config.logs
     files = {name: getattr(settings, name) for name in ("train", "validation", "test")}
     if settings.compressed:
         files["train"] = []
@@ -336,7 +344,8 @@ def _robust(fit: Fit, data: TrainingData, fitter: LogFitter, bars: Progress) -> 
     Warns:
         NumericalWarning: the passes were too few.
     """
-    loss, train = data.experiment.loss, [x for x in data.blocks if isinstance(x, Samples)]
+    loss = data.experiment.loss
+    train = [x for x in data.blocks if isinstance(x, Samples)]
     if loss is None:
         return fit, None
     bar = bars.add_task("weighing outliers down", total=loss.passes * sum(map(len, train)))

@@ -87,7 +87,8 @@ def sample(
     Raises:
         InputError: the folder is no run, or of an older version; a number out of range; a place that cannot be written.
     """
-    folder, out = Path(run), None if output is None else Path(output)
+    folder = Path(run)
+    out = None if output is None else Path(output)
     form = _form(form, out)
     count = _count(count, form)
     if prior_error != "auto" and not 0.0 < prior_error <= 100.0:
@@ -156,7 +157,8 @@ def _robots(samples: ParameterSamples, form: str, run: Path) -> Iterable[tuple[s
     """Names and texts of files of robots; what a format cannot say is warned of once."""
     robot = read_run(run).experiment.robot
     drawn = {what: samples.of_joints(what) for what in IN_FILES}
-    digits, suffix = len(str(len(samples) - 1)), {"urdf": ".urdf", "mjcf": ".xml"}[form]
+    digits = len(str(len(samples) - 1))
+    suffix = {"urdf": ".urdf", "mjcf": ".xml"}[form]
     for number, phi in enumerate(samples.phi.cpu().numpy()):
         joints = {what: {name: float(x[number]) for name, x in of.items()} for what, of in drawn.items()}
         fitted = FittedJoints(**joints)  # type: ignore[arg-type]

@@ -79,7 +79,8 @@ def _accuracy(
     reference: tuple[Assembly, RowBuilder] | None,
 ) -> SetAccuracy:
     settings = setup.config.estimator
-    builder, conditions = setup.builder(sensors), setup.conditions()
+    builder = setup.builder(sensors)
+    conditions = setup.conditions()
     fitter = setup.fitter(builder, conditions)
     if settings.name == "sgd":
         settings = replace(settings, name="least_squares")
@@ -96,6 +97,8 @@ def _accuracy(
     phi = calibration.parameters(evaluation)
     measured = evaluation.metrics(calibration.calibrate(test), phi[None])[0] if test else None
     possible = measured_components(setup.contacts, sensors)
-    channels, confounded = int(sensors.torque.sum() + possible.sum()), list_confounded(fit.extras)
-    words, advice = tuple(map(str, confounded)), tuple(one.in_short for one in confounded)
+    channels = int(sensors.torque.sum() + possible.sum())
+    confounded = list_confounded(fit.extras)
+    words = tuple(map(str, confounded))
+    advice = tuple(one.in_short for one in confounded)
     return SetAccuracy(channels, estimate.rank, measured, words, advice)

@@ -77,7 +77,8 @@ def require_trainable(config: ExperimentConfig, resume: bool) -> None:
     Raises:
         ConfigError: nothing to go on with, or an unfinished training in the way.
     """
-    output, inputs = config.output, inputs_of(config)
+    output = config.output
+    inputs = inputs_of(config)
     if config.estimator.name != "sgd" or output is None:
         if resume:
             sgd = config.estimator.name == "sgd"
@@ -111,10 +112,12 @@ class Training:
     def __init__(self, experiment: Experiment) -> None:
         """Fix the settings. Raises InputError: optimizer, schedule or a number that cannot be."""
         config = experiment.config
-        self.config, self.robot = config, experiment.robot
+        self.config = config
+        self.robot = experiment.robot
         self.folder = None if config.output is None else training_folder(config.output)
         self.settings = descent_settings(config, experiment.conditions())
-        self._text, self._saved = dump_config(config), 0
+        self._text = dump_config(config)
+        self._saved = 0
 
     def run(
         self,
@@ -223,7 +226,8 @@ class Training:
             progress(_described(epoch))
 
     def _evaluate(self, trainer: Trainer, evaluate: Evaluate, events: RunEvents | None) -> None:
-        step, phi = trainer.epoch, trainer.phi()
+        step = trainer.epoch
+        phi = trainer.phi()
         errors = evaluate(phi)
         if events is not None:
             events.write_errors(step, errors, by_epoch=True)

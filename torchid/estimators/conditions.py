@@ -172,7 +172,8 @@ def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: floa
     for body in np.flatnonzero(phi[:, parameters.INERTIAL].any(axis=1)):
         out += _inertia_violations(int(body), phi[body], scale[body], conditions.margin, tolerance)
     for enclosure in (e for e in conditions.enclosures if phi[e.body, parameters.MASS] > 0.0):
-        outside, condition = _excursion(phi[enclosure.body], enclosure), f"centre of mass outside its {enclosure.kind}"
+        outside = _excursion(phi[enclosure.body], enclosure)
+        condition = f"centre of mass outside its {enclosure.kind}"
         if outside > tolerance:
             out.append(Violation(enclosure.body, condition, outside, "of its size"))
     for mirror in conditions.mirrors:

@@ -153,7 +153,8 @@ class ConicProblem:
             Z: (K, 4, 4), positive semidefinite multipliers of the blocks; of weighted blocks, w_k / J_k and the like.
             y: (M,) >= 0, multipliers of the rows.
         """
-        blocks, weighted = self.blocks(x), self.weights > 0.0
+        blocks = self.blocks(x)
+        weighted = self.weights > 0.0
         multiplier_slopes = np.zeros_like(self.F)  # w F^-1 dF F^-1 of weighted blocks
         inverse = np.linalg.inv(blocks[weighted])[:, None]
         multiplier_slopes[weighted] = self.weights[weighted, None, None, None] * inverse @ self.F[weighted] @ inverse
@@ -214,7 +215,8 @@ def _reduced(rows: list[LinearCondition], count: int) -> tuple[Array, Array]:
     Raises:
         InputError: they contradict each other, or parameters that are not free.
     """
-    E, e = np.array([row.row for row in rows]).reshape(len(rows), count), np.array([row.bound for row in rows])
+    E = np.array([row.row for row in rows]).reshape(len(rows), count)
+    e = np.array([row.bound for row in rows])
     U, values, right = np.linalg.svd(E, full_matrices=False)
     kept = values > 1e-10 * values.max(initial=0.0)
     off = np.abs(e - U[:, kept] @ (U[:, kept].T @ e)) > EQUAL_WITHIN * (1.0 + np.abs(e).max(initial=0.0))
@@ -262,7 +264,8 @@ class _Scaled:
         stiff in all directions. In units of the scale it would be 1e20 times stiffer across a flat body than along it.
         """
         self.name, terms = conditions.body_name, 0 if problem.terms is None else len(problem.terms.size)
-        self.free, self.scale = problem.free.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY)
+        self.free = problem.free.reshape(-1, PER_BODY)
+        self.scale = problem.scale.reshape(-1, PER_BODY)
         self.start = np.concatenate([problem.nominal / problem.scale, np.zeros(terms)])
         self.parameters = int(problem.free.sum())
         self.place = (np.cumsum(problem.free) - 1).reshape(-1, PER_BODY)
@@ -270,7 +273,8 @@ class _Scaled:
         self.deviations = np.eye(self.parameters + terms)
         scaled = metric.reshape(-1, PER_BODY) / self.scale
         for body in self.bodies if prior != "euclidean" else ():
-            at, root = self.ten(body), _pseudo_inertia_root(scaled[body], self.name(body), prior)
+            at = self.ten(body)
+            root = _pseudo_inertia_root(scaled[body], self.name(body), prior)
             self.deviations[np.ix_(at, at)] = parameters.change_of_frame(root)
         self.slopes = np.zeros((len(self.start), len(self.deviations)))
         self.slopes[np.append(problem.free, np.ones(terms, dtype=bool))] = self.deviations
@@ -290,7 +294,8 @@ class _Scaled:
 
     def block(self, name: str, body: int, constant: Array, basis: Array) -> _Block:
         """The inequality constant + sum_v basis_v scaled_v >= 0, of a body's ten parameters, on x; basis (10, 4, 4)."""
-        variables, ten = self.ten(body), slice(PER_BODY * body, PER_BODY * body + len(basis))
+        variables = self.ten(body)
+        ten = slice(PER_BODY * body, PER_BODY * body + len(basis))
         F0 = constant + np.tensordot(self.start[ten], basis, axes=1)
         return _Block(name, F0, np.tensordot(self.slopes[ten][:, variables].T, basis, axes=1), variables)
 
@@ -330,7 +335,9 @@ def build_conic_problem(
     count = len(x.deviations)
     E, e = _reduced(_equalities(x, conditions), count)
     rows = _without_implied(rows, E, e)
-    weights, linear, metric = np.zeros(len(blocks)), np.zeros(count), np.eye(x.parameters, count)
+    weights = np.zeros(len(blocks))
+    linear = np.zeros(count)
+    metric = np.eye(x.parameters, count)
     for body in x.bodies if prior != "euclidean" else ():
         metric[x.ten(body)] = 0.0
         if prior == "entropic":  # of J_0^-1/2 J J_0^-1/2
@@ -368,25 +375,33 @@ def build_conic_problem(
 
 def _compressed(problem: LinearProblem, x: _Scaled, prior: Array) -> tuple[Array, Array, float]:
     """Data, with no more rows than columns, and quadratic prior as ||root x - target||^2 + constant."""
-    rows, terms, count = max(problem.rows, 1), problem.terms, len(x.deviations)
-    columns, b = problem.A * problem.scale, problem.b - problem.A @ problem.nominal
+    rows = max(problem.rows, 1)
+    terms = problem.terms
+    count = len(x.deviations)
+    columns = problem.A * problem.scale
+    b = problem.b - problem.A @ problem.nominal
     if terms is not None:
         of_terms = np.hstack([terms.C * problem.scale, terms.D * terms.size])
         columns = np.vstack([np.hstack([columns, np.zeros((len(columns), len(terms.size)))]), of_terms])
         b = np.append(b, terms.z - terms.C @ problem.nominal)
-    A, b, unexplained = columns @ x.slopes / np.sqrt(rows), b / np.sqrt(rows), problem.residual / rows
+    A = columns @ x.slopes / np.sqrt(rows)
+    b = b / np.sqrt(rows)
+    unexplained = problem.residual / rows
     if len(A) > count:
         triangle = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))
-        A, b = triangle[:count, :count], triangle[:count, count]
+        A = triangle[:count, :count]
+        b = triangle[:count, count]
         unexplained += float(np.square(triangle[count:, count]).sum())
     return np.concatenate([A, prior]), np.append(b, np.zeros(len(prior))), unexplained
 
 
 def _ellipsoid_block(x: _Scaled, enclosure: Enclosure) -> _Block:
     """[[m 1, u], [u^T, m]] with u = (m com - m centre) / half along the axes: positive iff |u| <= m."""
-    body, basis = enclosure.body, np.zeros((10, 4, 4))
+    body = enclosure.body
+    basis = np.zeros((10, 4, 4))
     to_axes = (enclosure.axes / enclosure.half).T  # (3, 3)
-    mass, moments = x.scale[body, parameters.MASS], x.scale[body, parameters.FIRST_MOMENT]
+    mass = x.scale[body, parameters.MASS]
+    moments = x.scale[body, parameters.FIRST_MOMENT]
     basis[parameters.MASS] = np.eye(4)
     basis[parameters.MASS, :3, 3] = basis[parameters.MASS, 3, :3] = -(to_axes @ enclosure.centre)
     for number, column in zip(range(10)[parameters.FIRST_MOMENT], (to_axes * moments / mass).T, strict=True):
@@ -396,7 +411,8 @@ def _ellipsoid_block(x: _Scaled, enclosure: Enclosure) -> _Block:
 
 def _box_conditions(x: _Scaled, enclosure: Enclosure) -> list[LinearCondition]:
     """M half +- (m com - m centre) >= 0 along each axis of the box."""
-    body, out = enclosure.body, []
+    body = enclosure.body
+    out = []
     moments = x.scale[body, parameters.FIRST_MOMENT] / x.scale[body, parameters.MASS]
     for axis, half in zip(enclosure.axes.T, enclosure.half, strict=True):
         for sign in (1.0, -1.0):
@@ -431,14 +447,16 @@ def _equalities(x: _Scaled, conditions: Conditions) -> list[LinearCondition]:
         weights = {(body, parameters.MASS): float(mass) for body, mass in enumerate(masses)}
         out.append(x.condition("total_mass", weights, 1.0))
     for mirror in conditions.mirrors:
-        body, image = mirror.body, mirror.image
+        body = mirror.body
+        image = mirror.image
         for number, row in enumerate(mirror_matrix(mirror.reflection)):
             weights = {(image, number): -1.0}
             for other, weight in enumerate(row * scale[body] / scale[image, number]):
                 weights[body, other] = weights.get((body, other), 0.0) + float(weight)
             out.append(x.condition(f"{x.name(image)} as mirror image of {x.name(body)}", weights, 0.0))
     for body, number in zip(*np.nonzero((upper - lower <= EQUAL_WITHIN * scale) & x.free), strict=True):
-        least, most = lower[body, number], upper[body, number]
+        least = lower[body, number]
+        most = upper[body, number]
         name = f"bounds of {parameters.PARAMETERS[number]} of {x.name(body)}"
         if least - most > EQUAL_WITHIN * scale[body, number]:
             raise InputError("estimator", name, f"{least:g} above {most:g}", "a lower bound below the upper one")
@@ -482,12 +500,14 @@ def find_strictly_feasible(problem: ConicProblem) -> tuple[Array, int]:
     if problem.slack(inside).min() > _GOOD_SLACK:
         return inside, 0
     path = PrimalDual(_phase_one(problem))
-    point, steps = path.start(np.append(x, 1.0 - worst)), 0
+    point = path.start(np.append(x, 1.0 - worst))
+    steps = 0
     while point.complementarity > 0.1 * _LEAST_SLACK and steps < _STEPS:
         after = path.step(point)
         if after is None:
             break
-        point, steps = after, steps + 1
+        point = after
+        steps = steps + 1
         if problem.slack(point.x.numpy()[:-1]).min() > _GOOD_SLACK:
             return point.x.numpy()[:-1], steps
     z = point.x.numpy()
@@ -520,7 +540,9 @@ def _phase_one(problem: ConicProblem) -> ConicProblem:
     Boyd, Vandenberghe, section 11.4, with two additions: a small quadratic, for directions without a minimum, and a
     lower bound on s, which saves steps.
     """
-    n, blocks, rows = len(problem.linear), len(problem.F0), len(problem.h)
+    n = len(problem.linear)
+    blocks = len(problem.F0)
+    rows = len(problem.h)
     return replace(
         problem,
         root=_PHASE_ONE_ROOT * np.hstack([problem.deviations, np.zeros((n, 1))]),
@@ -542,7 +564,8 @@ def damped_inverse(A: Tensor) -> Callable[[Tensor], Tensor]:
     Of A, which it overwrites, the lower triangle counts.
     """
     scale = A.diagonal().abs().clamp_min(torch.finfo(A.dtype).tiny).rsqrt()
-    scaled, damping = A.mul_(scale).mul_(scale[:, None]), 0.0
+    scaled = A.mul_(scale).mul_(scale[:, None])
+    damping = 0.0
     while True:
         root, failed = torch.linalg.cholesky_ex(scaled)
         if not failed:
@@ -585,13 +608,16 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
     x, steps = find_strictly_feasible(problem)
     path = PrimalDual(problem)
     point = path.start(x)
-    best, worse = Solution(x, problem.objective(x), np.inf, steps), 0
+    best = Solution(x, problem.objective(x), np.inf, steps)
+    worse = 0
     for count in range(1, _STEPS + 1):
         after = path.step(point)
         if after is not None:
-            point, steps = after, steps + 1
+            point = after
+            steps = steps + 1
         x = point.x.numpy()
-        objective, last = problem.objective(x), after is None or count == _STEPS
+        objective = problem.objective(x)
+        last = after is None or count == _STEPS
         scale = max(objective, problem.floor)
         far = point.complementarity > _CENTRED * max(tolerance, _ACCURATE) * scale
         if far and not last and not problem.weights.any():
@@ -648,9 +674,11 @@ class PrimalDual:
     def __init__(self, problem: ConicProblem) -> None:
         """They share memory with the arrays."""
         self.problem = problem
-        self.F0, self.F = torch.from_numpy(problem.F0), torch.from_numpy(problem.F)
+        self.F0 = torch.from_numpy(problem.F0)
+        self.F = torch.from_numpy(problem.F)
         self.variables = torch.from_numpy(problem.variables)
-        self.G, self.h = torch.from_numpy(problem.G), torch.from_numpy(problem.h)
+        self.G = torch.from_numpy(problem.G)
+        self.h = torch.from_numpy(problem.h)
         self.H = torch.from_numpy(problem.hessian)
         self._row_columns = torch.from_numpy(np.flatnonzero(problem.G.any(axis=0)))  # bounds are on one variable each
         self._rows = self.G[:, self._row_columns]
@@ -714,7 +742,8 @@ class PrimalDual:
 
     def centre(self, x: np.ndarray, kappa: float) -> np.ndarray:
         """The point of the central path at a barrier weight, (n,), from a strictly feasible one."""
-        point, none = self.start(x), torch.zeros(())
+        point = self.start(x)
+        none = torch.zeros(())
         for _ in range(_STEPS):
             target = max(kappa, _CENTRE_SHRINK * point.complementarity / max(self.problem.degree, 1))
             move = self._newton(point)(target, none, none)
@@ -751,7 +780,8 @@ class PrimalDual:
         curvature = flat @ (whitened @ point.Z[:, None]).flatten(2).mT
         stiffness = point.y / point.slack
         hessian = self.with_rows(stiffness)
-        rows, columns = self.variables[:, :, None], self.variables[:, None, :]
+        rows = self.variables[:, :, None]
+        columns = self.variables[:, None, :]
         hessian.index_put_((rows.expand_as(curvature), columns.expand_as(curvature)), curvature, accumulate=True)
         N = self.null_space
         invert = damped_inverse(hessian if N is None else N.T @ hessian @ N)
@@ -762,7 +792,8 @@ class PrimalDual:
             y = (kappa - row_correction) / point.slack - point.y
             slope = gathered(Z) + self.G.T @ y - gradient
             x = invert(slope) if N is None else N @ invert(N.T @ slope)
-            blocks, slack = (x[self.variables, None, None] * whitened).sum(1), self.G @ x
+            blocks = (x[self.variables, None, None] * whitened).sum(1)
+            slack = self.G @ x
             return _Direction(x, blocks, slack, Z - _symmetric(blocks @ point.Z), y - stiffness * slack)
 
         return solve

@@ -68,7 +68,8 @@ class Consistent(Regularized):
             ValueError: columns that are not twelve for each body.
         """
         problem.require_bodies()
-        plain, found = self.least_squares.solve(problem), self._minimum(problem)
+        plain = self.least_squares.solve(problem)
+        found = self._minimum(problem)
         phi, psi = found.minimizer
         return ConsistentEstimate(
             **(vars(plain) | {"phi": phi, "psi": psi, "cost": problem.cost(phi, psi)}),
@@ -91,7 +92,8 @@ class Consistent(Regularized):
         coupled = _with_decoupled_fixed(problem, self.conditions)
         conic = build_conic_problem(coupled, self.conditions, self.ridge or _least_ridge(coupled), self.prior)
         solution = _solve(conic, 1e-9 if self.ridge else 1e-12)
-        phi, psi = problem.nominal.copy(), None
+        phi = problem.nominal.copy()
+        psi = None
         moved, terms = np.split(conic.deviations @ solution.x, [int(coupled.free.sum())])
         phi[coupled.free] += problem.scale[coupled.free] * moved
         if problem.terms is not None:

@@ -254,16 +254,22 @@ class LeastSquares(Regularized):
         Raises:
             InputError: a decomposition failed.
         """
-        free, scale = problem.free, problem.scale[problem.free]
-        inverse, phi = self._inverse(problem), self.minimize(problem).phi
-        A, values, rank = inverse.A.numpy(), inverse.values.numpy(), inverse.rank
+        free = problem.free
+        scale = problem.scale[problem.free]
+        inverse = self._inverse(problem)
+        phi = self.minimize(problem).phi
+        A = inverse.A.numpy()
+        values = inverse.values.numpy()
+        rank = inverse.rank
         gain = inverse.solve(np.array([problem.rows * self.ridge]), torch.eye(len(A), dtype=torch.float64))[0].numpy()
         null_share = np.linalg.norm(np.eye(A.shape[1]) - inverse.row_space.numpy(), axis=1)  # of each in the null space
         cost = problem.cost(phi)
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
-        observable, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
+        observable = np.zeros(len(phi), dtype=bool)
+        identifiable = np.zeros(len(phi), dtype=bool)
         observable[free], identifiable[free] = null_share**2 < 1.0 - _OBSERVABLE, null_share < UNOBSERVABLE_SHARE
-        noise_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
+        noise_error = np.full(len(phi), np.nan)
+        data_share = np.full(len(phi), np.nan)
         noise_error[free], by_data = noise * scale * np.linalg.norm(gain, axis=1), A
         if problem.shrinkage is not None and problem.parameter_shrinkage is not None:
             noise_error[free] = np.hypot(noise_error[free], scale * np.linalg.norm(gain @ problem.shrinkage, axis=1))
@@ -271,7 +277,8 @@ class LeastSquares(Regularized):
         noise_error[~identifiable] = np.nan
         kept_error = None
         if self.ridge:
-            kept, kept_error = np.eye(A.shape[1]) - gain @ A, np.where(identifiable & free, 0.0, np.nan)
+            kept = np.eye(A.shape[1]) - gain @ A
+            kept_error = np.where(identifiable & free, 0.0, np.nan)
             kept_error[free] += scale * np.linalg.norm(kept * nominal_spread(problem, noise), axis=1)
         data_share[free] = np.clip(np.einsum("pr,rp->p", gain, by_data), 0.0, 1.0)  # diagonal of gain @ A
         return Estimate(

@@ -75,13 +75,15 @@ class Posterior:
 
     def _with_data(self, prior: ConicProblem) -> ConicProblem:
         """The problem of the prior alone with the data, and with the extra parameters as further variables."""
-        count, extras = int(self.free.sum()), len(self.extra_size)
+        count = int(self.free.sum())
+        extras = len(self.extra_size)
         by_free = (self.A[:, self.free] * self.scale[self.free]) @ prior.deviations
         root = np.concatenate([by_free, prior.root, np.zeros((extras, count))])
         of_extras = np.concatenate([self.D * self.extra_size, np.zeros((len(prior.root), extras)), np.eye(extras)])
         target = np.concatenate([self.b - self.A @ self.nominal, prior.target, np.zeros(extras)])
         triangle = np.asarray(np.linalg.qr(np.column_stack([root, of_extras, target]), mode="r"))
-        size, bounded = count + extras, np.isfinite(self.extra_lower)
+        size = count + extras
+        bounded = np.isfinite(self.extra_lower)
         return replace(
             prior,
             root=triangle[:size, :size],
@@ -253,7 +255,8 @@ def nominal_spread(problem: LinearProblem, noise: float) -> Array:
     """
     columns = problem.A[:, problem.free] * problem.scale[problem.free]
     target = problem.b - problem.A @ problem.nominal
-    place, spread = np.flatnonzero(problem.free) % PER_BODY, np.zeros(columns.shape[1])
+    place = np.flatnonzero(problem.free) % PER_BODY
+    spread = np.zeros(columns.shape[1])
     size = max(float(np.linalg.norm(problem.b)), float(np.linalg.norm(columns)))
     if size == 0.0:
         return spread
@@ -283,5 +286,6 @@ def _likelihood_of_widths(rows: Array, widths: Array) -> Array | None:
     kept = is_significant(values, RANK_TOLERANCE)
     if not kept.any():
         return None
-    found, of_data = np.square(U[:, kept].T @ rows[:, -1]), 1.0 + np.outer(np.square(widths), np.square(values[kept]))
+    found = np.square(U[:, kept].T @ rows[:, -1])
+    of_data = 1.0 + np.outer(np.square(widths), np.square(values[kept]))
     return np.asarray(-(np.log(of_data) + found / of_data).sum(axis=1))

@@ -267,7 +267,8 @@ class LogCholeskyParameters(LearnableParameters):
         Raises:
             ValueError: inertial parameters that are not free body by body.
         """
-        free, bodies = problem.free.reshape(-1, PER_BODY), problem.free_bodies()
+        free = problem.free.reshape(-1, PER_BODY)
+        bodies = problem.free_bodies()
         moving = np.zeros(free.shape, dtype=bool)
         moving[bodies, INERTIAL] = True
         frictional = (free & ~moving).ravel()
@@ -294,7 +295,8 @@ class LogCholeskyParameters(LearnableParameters):
         """Parameters (12 L,) at log-Cholesky coordinates `u`, ten by body, then friction."""
         bodies = len(self.root)
         coordinates = u[: INERTIAL.stop * bodies].reshape(bodies, INERTIAL.stop)
-        rows, columns = self.get_buffer("_rows"), self.get_buffer("_columns")
+        rows = self.get_buffer("_rows")
+        columns = self.get_buffer("_columns")
         entries = torch.where(rows == columns, coordinates.exp(), coordinates)
         M = entries.new_zeros(bodies, 4, 4)
         M[:, rows, columns] = entries
@@ -302,7 +304,8 @@ class LogCholeskyParameters(LearnableParameters):
         J = R @ R.mT + self.margin * torch.eye(4, dtype=u.dtype, device=u.device)
         ten = J.flatten(1) @ self.get_buffer("_from_pseudo").T
         friction = nn.functional.softplus(u[INERTIAL.stop * bodies :] + self.friction_start)
-        inertial, frictional = self.get_buffer("_inertial"), self.get_buffer("_frictional")
+        inertial = self.get_buffer("_inertial")
+        frictional = self.get_buffer("_frictional")
         phi = self.nominal.masked_scatter(inertial, ten.flatten() * self.scale[inertial])
         return phi.masked_scatter(frictional, friction * self.scale[frictional])
 
@@ -452,7 +455,8 @@ class Sgd(TrainingSettings, Regularized):
         learnable: LearnableParameters = FreeParameters(problem)
         damping = self.damping + self.penalties.curvature
         if self.consistency == "log_cholesky":
-            learnable, damping = LogCholeskyParameters(problem, self.conditions.margin), self.damping
+            learnable = LogCholeskyParameters(problem, self.conditions.margin)
+            damping = self.damping
         learnable.precondition(problem, self.ridge, damping)
         return learnable
 
@@ -484,9 +488,12 @@ class Objective(nn.Module):
     def __init__(self, settings: Sgd, problem: LinearProblem) -> None:
         """Of a descent's settings, and the compressed samples."""
         super().__init__()
-        self._margin, self._weights = settings.conditions.margin, settings.penalties
-        conic, terms = settings.conic_problem(problem), problem.terms
-        self.floor, self.constant = conic.floor, conic.constant
+        self._margin = settings.conditions.margin
+        self._weights = settings.penalties
+        conic = settings.conic_problem(problem)
+        terms = problem.terms
+        self.floor = conic.floor
+        self.constant = conic.constant
         self._data_rows = min(len(problem.A) + (len(terms.C) if terms else 0), len(conic.linear))
         inverse = np.linalg.inv(conic.deviations)
         weighted = conic.weights > 0.0
@@ -553,7 +560,8 @@ def least_penalized(settings: Sgd, problem: LinearProblem, start: Minimizer) -> 
         problem: the compressed samples.
         start: where the descent ended.
     """
-    penalized, y = Objective(settings, problem), deviations(problem, start)
+    penalized = Objective(settings, problem)
+    y = deviations(problem, start)
     damping = 1e-6 * float(penalized.hessian.diagonal().max()) + settings.penalties.curvature
     P = _inverse_root(penalized.hessian, damping).numpy()
 
@@ -580,7 +588,8 @@ def nearest_allowed(settings: Sgd, problem: LinearProblem, found: Minimizer) -> 
     x = np.asarray(np.linalg.solve(conic.deviations, deviations(problem, found)), dtype=np.float64)
     if conic.slack(x).min(initial=0.0) >= -_MET and np.abs(conic.E @ x - conic.e).max(initial=0.0) <= _MET:
         return found
-    terms, moved = problem.terms, replace(problem, nominal=found.phi, b=problem.A @ found.phi, residual=0.0)
+    terms = problem.terms
+    moved = replace(problem, nominal=found.phi, b=problem.A @ found.phi, residual=0.0)
     if terms is not None and found.psi is not None:
         moved = replace(moved, terms=replace(terms, z=terms.C @ found.phi + terms.D @ found.psi))
     return replace(settings.consistent, prior="euclidean").minimize(moved)

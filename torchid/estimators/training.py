@@ -88,7 +88,8 @@ class Loss(nn.Module):
         """Arguments as of `Trainer`, with the parameters to learn."""
         super().__init__()
         self.settings = settings
-        self.learnable, self.residual = learnable, residual
+        self.learnable = learnable
+        self.residual = residual
         self._columns = batches.columns
         self._per_row = batches.samples / max(problem.rows, 1)
         self._processes = batches.share[1]
@@ -102,9 +103,11 @@ class Loss(nn.Module):
             batch: or what this process has of it.
             size: samples that all processes have in it, if they share it; their terms add up to those of the batch.
         """
-        settings, phi = self.settings, self.learnable()
+        settings = self.settings
+        phi = self.learnable()
         rigid, other = self.forces(batch, phi)
-        share, of_one = self._per_row / (size or len(batch)), 1.0 / self._processes
+        share = self._per_row / (size or len(batch))
+        of_one = 1.0 / self._processes
         misfit = (rigid if other is None else rigid + other) - batch.f
         losses = {"data": share * misfit.square().sum()}
         if self._beside is not None:
@@ -143,12 +146,15 @@ class Loss(nn.Module):
 
         `phi`: parameters and terms; None for those that are learned.
         """
-        total, rows, phi = 0.0, 0, self.learnable() if phi is None else phi
+        total = 0.0
+        rows = 0
+        phi = self.learnable() if phi is None else phi
         with self.evaluating():
             for batch in batches.chunks():
                 rigid, other = self.forces(batch, phi)
                 misfit = (rigid if other is None else rigid + other) - batch.f
-                total, rows = total + float(misfit.square().sum()), rows + batch.rows
+                total = total + float(misfit.square().sum())
+                rows = rows + batch.rows
         if batches.share[1] > 1:
             total, rows = (sum(parts) for parts in zip(*distributed.all_gather((total, rows), "loss"), strict=True))
         return total / max(rows, 1)
@@ -168,7 +174,9 @@ def _difference(problem: LinearProblem, data: LinearProblem, device: torch.devic
     """Mean square that a problem has beside that of the samples alone, as of known masses, at parameters and terms."""
 
     def quadratic(one: LinearProblem) -> tuple[Tensor, Tensor]:
-        A, b, terms = one.A, one.b, one.terms
+        A = one.A
+        b = one.b
+        terms = one.terms
         if terms is not None:
             A = np.block([[A, np.zeros((len(A), len(terms.size)))], [terms.C, terms.D]])
             b = np.append(b, terms.z)
@@ -197,14 +205,13 @@ def residual_effect(loss: Loss, batches: MiniBatches) -> ResidualEffect | None:
     """The force of a loss's residual module on some samples; None without a module."""
     if loss.residual is None:
         return None
-    base_rows = batches.builder.tree.base_rows
     with_module: dict[str, float] = {}
     alone: dict[str, float] = {}
     with loss.evaluating():
         phi = loss.learnable().cpu().numpy()
         for (q, v, a), rigid in batches.generalized_forces(phi):
             force = loss.residual(q, v, a)
-            for name, rows in _groups(base_rows, v.shape[1], rigid.shape[1]).items():
+            for name, rows in _groups(batches.builder.tree.base_rows, v.shape[1], rigid.shape[1]).items():
                 per_row = 1.0 / (batches.samples * (rows.stop - rows.start))
                 for sums, part in ((alone, force), (with_module, rigid + force)):
                     sums[name] = sums.get(name, 0.0) + per_row * float(part[:, rows].square().sum())
@@ -318,7 +325,10 @@ class Trainer:
             found = f"a share of {batches.share[1]}, with a residual module or {settings.optimizer['name']}"
             raise ValueError(f"batches: {found}; accepted: whole batches")
         settings.try_out()
-        self.settings, self.problem, self.batches, self.held_out = settings, problem, batches, held_out
+        self.settings = settings
+        self.problem = problem
+        self.batches = batches
+        self.held_out = held_out
         self.closed_form = settings.least_squares.solve(problem)
         self._conic = settings.conic_problem(problem)
         self._least = self._conic.unconstrained
@@ -332,7 +342,9 @@ class Trainer:
             groups[1]["lr"] = settings.residual_lr
         self.optimizer = make_optimizer(settings.optimizer, groups)
         self.schedule = make_schedule(settings.schedule, self.optimizer, settings.epochs)
-        self.epoch, self.best_epoch, self.best_loss = 0, 0, float("inf")
+        self.epoch = 0
+        self.best_epoch = 0
+        self.best_loss = float("inf")
         self._best = self._snapshot()
 
     def __repr__(self) -> str:
@@ -369,7 +381,8 @@ class Trainer:
         """
         self.epoch += 1
         self.loss.train()
-        rate, start = float(self.optimizer.param_groups[0]["lr"]), time.perf_counter()
+        rate = float(self.optimizer.param_groups[0]["lr"])
+        start = time.perf_counter()
         losses: dict[str, float] = {}
         squares: dict[str, float] = {}
         with one_thread():
@@ -382,7 +395,8 @@ class Trainer:
             elapsed = time.perf_counter() - start
             held_out = None if self.held_out is None else self.loss.mean_square(self.held_out)
         losses["total"] = sum(losses.values())
-        found, size = self._minimizer(), squares.pop("measured")
+        found = self._minimizer()
+        size = squares.pop("measured")
         with np.errstate(over="ignore", invalid="ignore"):
             self._require_converging(self._objective(found))  # after the last step: losses are those before it
         self._require_converging(0.0 if held_out is None else held_out)
@@ -390,7 +404,8 @@ class Trainer:
             self._require_converging(float("nan"))  # of a module, in the last step
         step_schedule(self.schedule, losses["total"] if held_out is None else held_out)
         if held_out is None or held_out < self.best_loss * (1.0 - _BETTER):
-            self.best_epoch, self.best_loss = self.epoch, losses["total"] if held_out is None else held_out
+            self.best_epoch = self.epoch
+            self.best_loss = losses["total"] if held_out is None else held_out
             self._best = self._snapshot()
         return Epoch(
             number=self.epoch,
@@ -423,7 +438,8 @@ class Trainer:
         parameter's scale away. Statistics are those of least squares with the same ridge.
         """
         self.loss.load_state_dict(self._best)
-        plain, found = self.closed_form, self._minimizer()
+        plain = self.closed_form
+        found = self._minimizer()
         finish = self.finished and self.held_out is None and self.loss.residual is None and self.settings.finish
         if self.settings.consistency == "penalties":
             found = least_penalized(self.settings, self.problem, found) if finish else found
@@ -473,7 +489,8 @@ class Trainer:
             self.schedule.load_state_dict(copy.deepcopy(state["schedule"]))
         torch.set_rng_state(state["random"][0])
         torch.cuda.set_rng_state_all(state["random"][1:])
-        self.epoch, self.best_epoch = state["epoch"], state["best_epoch"]
+        self.epoch = state["epoch"]
+        self.best_epoch = state["best_epoch"]
         self.best_loss = float(state["best_loss"])
 
     def _load_optimizer(self, state: dict[str, Any]) -> None:
@@ -496,7 +513,8 @@ class Trainer:
 
     def _require_converging(self, loss: float) -> None:
         if not loss <= _DIVERGED * max(1.0, self.problem.cost(self.problem.nominal) / max(self.problem.rows, 1)):
-            name, rate = self.settings.optimizer["name"], float(self.optimizer.param_groups[0]["lr"])
+            name = self.settings.optimizer["name"]
+            rate = float(self.optimizer.param_groups[0]["lr"])
             found = f"a loss of {loss:.3g} in epoch {self.epoch}, with {name} at lr {rate:.3g}"
             raise InputError("estimator", "training", found, "a smaller lr")
 
@@ -516,7 +534,8 @@ class Trainer:
             self.optimizer.zero_grad()
             terms = LossTerms({}, {})
             for batch, size in batches():
-                part, share = self.loss(batch, size), size / samples
+                part = self.loss(batch, size)
+                share = size / samples
                 (share * part.total()).backward()
                 terms = terms.plus(part, share)
             if self.batches.share[1] > 1:

@@ -127,13 +127,15 @@ def _outside(conic: ConicProblem, x: Array) -> np.ndarray:
 
 def _gaussian_at(conic: ConicProblem, mean: Array, near: np.ndarray) -> BarrierGaussian:
     """The Gaussian of a minimizer; LinAlgError where rounding says that this is not inside all conditions."""
-    count, n = len(conic.F0), len(conic.linear)
+    count = len(conic.F0)
+    n = len(conic.linear)
     inverse = np.linalg.inv(np.linalg.cholesky(conic.blocks(mean)))[:, None]
     slack = conic.G @ mean - conic.h
     if not (slack > 0.0).all():
         raise np.linalg.LinAlgError("by rounding, a point is not inside the conditions")
     slopes = (inverse @ conic.F @ np.swapaxes(inverse, 2, 3))[:, :, UPPER[0], UPPER[1]]
-    blocks, rows = np.zeros((count, len(ENTRY_WEIGHTS), n)), conic.G / slack[:, None]
+    blocks = np.zeros((count, len(ENTRY_WEIGHTS), n))
+    rows = conic.G / slack[:, None]
     np.put_along_axis(blocks, conic.variables[:, None], np.swapaxes(slopes, 1, 2), axis=2)
     of_blocks = (blocks[near[:count]] * np.sqrt(CURVATURE * ENTRY_WEIGHTS)[:, None]).reshape(-1, n)
     of_rows = np.sqrt(CURVATURE) * rows[near[count:]]
@@ -230,7 +232,8 @@ class EllipticalSlice(torch.nn.Module):
         self._groups = 0
         for variables in (np.arange(len(owners)), *_pairs(gaussian, owners)):
             self._add_group(gaussian, conic.E, variables)
-        self.moved, self.passes = 1, 1  # groups that move in a pass, the first one all variables together
+        self.moved = 1
+        self.passes = 1  # groups that move in a pass, the first one all variables together
         self._measure()
 
     def _add_group(self, gaussian: BarrierGaussian, E: Array, variables: np.ndarray) -> None:
@@ -305,14 +308,18 @@ class EllipticalSlice(torch.nn.Module):
     def _move(self, state: _State, group: _Group, generator: torch.Generator | None) -> None:
         centre = -(group.basis.T @ state.whitened)  # of y, which is 0 at the state
         drawn = torch.randn(centre.shape, dtype=torch.float64, device=centre.device, generator=generator)
-        blocks, rows = state.blocks[group.blocks], state.rows[group.rows]
+        blocks = state.blocks[group.blocks]
+        rows = state.rows[group.rows]
         near = self.near[: len(state.blocks)][group.blocks], self.near[len(state.blocks) :][group.rows]
         cut = 10 * len(blocks)
         now = torch.cat([blocks.flatten(0, 1), rows])
-        along, across = group.change @ centre, group.change @ drawn
+        along = group.change @ centre
+        across = group.change @ drawn
         angle = self._angle((now, along, across), cut, near, generator)
-        versed, sine = 1.0 - torch.cos(angle), torch.sin(angle)
-        y, changed = centre * versed + drawn * sine, along * versed + across * sine
+        versed = 1.0 - torch.cos(angle)
+        sine = torch.sin(angle)
+        y = centre * versed + drawn * sine
+        changed = along * versed + across * sine
         state.x[group.variables] += group.spread @ y
         state.whitened += group.basis @ y
         state.blocks[group.blocks] += changed[:cut].view(-1, 10, changed.shape[1])
@@ -337,15 +344,19 @@ class EllipticalSlice(torch.nn.Module):
         uniform = _uniform(now, generator)
         level = self._excess(now, cut, near) + torch.log(uniform())
         angle = 2.0 * math.pi * uniform()
-        least, most = angle - 2.0 * math.pi, angle
-        out, left = torch.zeros_like(angle), torch.arange(len(angle), device=angle.device)
+        least = angle - 2.0 * math.pi
+        most = angle
+        out = torch.zeros_like(angle)
+        left = torch.arange(len(angle), device=angle.device)
         for count in _TRIES:
             tried = angle.new_empty(count, len(angle))
             for number in range(count):  # as if all before had failed, so that these need not be known to have
                 tried[number] = angle
-                least, most = torch.where(angle < 0.0, angle, least), torch.where(angle < 0.0, most, angle)
+                least = torch.where(angle < 0.0, angle, least)
+                most = torch.where(angle < 0.0, most, angle)
                 angle = torch.lerp(least, most, _uniform(now, generator)())
-            versed, sine = 1.0 - torch.cos(tried), torch.sin(tried)
+            versed = 1.0 - torch.cos(tried)
+            sine = torch.sin(tried)
             there = (now[:, None] + along[:, None] * versed + across[:, None] * sine).flatten(1)
             fits = inside(there[:cut].view(-1, 10, there.shape[1]) + self.unit, there[cut:])
             fits &= self._excess(there, cut, near) >= level.repeat(count)
@@ -364,7 +375,8 @@ class EllipticalSlice(torch.nn.Module):
 
         With E = J^-1/2 F_k J^-1/2 - 1 of a block that has a barrier it is ||E||^2 / 2 - tr E, and likewise of a row.
         """
-        blocks, rows = entries[:cut].view(-1, 10, entries.shape[1]), entries[cut:]
+        blocks = entries[:cut].view(-1, 10, entries.shape[1])
+        rows = entries[cut:]
         of_blocks = 0.5 * CURVATURE * (self.weights * blocks.square()).sum(1) - blocks[:, _DIAGONAL].sum(1)
         return near[0] @ of_blocks + near[1] @ (0.5 * CURVATURE * rows.square() - rows)
 
@@ -378,10 +390,16 @@ def inside(blocks: Tensor, rows: Tensor) -> Tensor:
     """Where all blocks, (K, 10, B), are positive definite, and all rows, (M, B), above -1: (B,) bool."""
     a, b, c, d, e, f, g, h, i, j = blocks.unbind(1)  # rows a b c d, e f g, h i, j of the upper triangle
     first = 1.0 / a
-    e, f, g = e - b * b * first, f - b * c * first, g - b * d * first
-    h, i, j = h - c * c * first, i - c * d * first, j - d * d * first
+    e = e - b * b * first
+    f = f - b * c * first
+    g = g - b * d * first
+    h = h - c * c * first
+    i = i - c * d * first
+    j = j - d * d * first
     second = 1.0 / e
-    h, i, j = h - f * f * second, i - f * g * second, j - g * g * second
+    h = h - f * f * second
+    i = i - f * g * second
+    j = j - g * g * second
     last = j - i * i / h
     pivots = torch.minimum(torch.minimum(a, e), torch.minimum(h, last))  # NaN where one before is 0
     return (pivots > _INSIDE).all(0) & (rows > _INSIDE - 1.0).all(0)
@@ -401,7 +419,9 @@ def _pairs(gaussian: BarrierGaussian, owners: np.ndarray) -> list[np.ndarray]:
     scaled = gaussian.directions / np.where(deviation > 0.0, deviation, 1.0)[:, None]
     member = (owners[:, None] == bodies).astype(np.float64)
     together = member.T @ np.square(scaled @ scaled.T) @ member
-    inside, outside, pairs = [0], list(range(1, len(bodies))), []
+    inside = [0]
+    outside = list(range(1, len(bodies)))
+    pairs = []
     while outside:
         row, column = np.unravel_index(int(together[np.ix_(inside, outside)].argmax()), (len(inside), len(outside)))
         pairs.append((inside[row], outside[column]))
@@ -451,18 +471,18 @@ class TruncatedGaussian(torch.nn.Module):
         super().__init__()
         gaussian = barrier_gaussian(conic)
         split = _Split.of(conic, gaussian)
-        self.near, self.conditions = int(gaussian.near.sum()), len(gaussian.near)
+        self.near = int(gaussian.near.sum())
+        self.conditions = len(gaussian.near)
         self.chains = None
         if len(split.near):
             self.chains = EllipticalSlice(*split.marginal(conic, gaussian), owners[split.near])
-        blocks, rows = split.blocks, split.rows
         arrays = {
             "mean": gaussian.mean,
             "near_variables": split.near,
             "far_variables": split.far,
             **split.given(conic),
-            "block_changes": gaussian.blocks[~blocks].reshape(-1, len(gaussian.mean)),
-            "row_changes": gaussian.rows[~rows],
+            "block_changes": gaussian.blocks[~split.blocks].reshape(-1, len(gaussian.mean)),
+            "row_changes": gaussian.rows[~split.rows],
             "unit": np.eye(4)[np.triu_indices(4)][:, None],
         }
         for name, array in arrays.items():
@@ -475,7 +495,8 @@ class TruncatedGaussian(torch.nn.Module):
             count: number of them.
             generator: of random numbers, on that device; None for torch's own.
         """
-        device, batches = self.mean.device, max(1, min(_BATCHES, count // _BATCH_CHAINS))
+        device = self.mean.device
+        batches = max(1, min(_BATCHES, count // _BATCH_CHAINS))
         seeds = torch.randint(2**62, (batches,), generator=generator, device=device).tolist()
         counts = [count * (k + 1) // batches - count * k // batches for k in range(batches)]
         tasks = list(enumerate(zip(counts, seeds, strict=True)))
@@ -486,7 +507,9 @@ class TruncatedGaussian(torch.nn.Module):
 
     def _batch(self, count: int, seed: int) -> Tensor:
         """Points (n, count)."""
-        generator, found, out = torch.Generator(self.mean.device).manual_seed(seed), 0, []
+        generator = torch.Generator(self.mean.device).manual_seed(seed)
+        found = 0
+        out = []
         for near in self._states(min(count, _BATCH_CHAINS), generator):
             out.append(self._completed(near, generator))
             found += out[-1].shape[1]
@@ -534,15 +557,19 @@ class _Split:
         near_blocks, near_rows = np.split(gaussian.near, [len(conic.F0)])
         chosen = conic.G[near_rows].any(axis=0) | conic.E.any(axis=0)
         chosen[conic.variables[near_blocks]] = True
-        near, far = np.flatnonzero(chosen), np.flatnonzero(~chosen)
+        near = np.flatnonzero(chosen)
+        far = np.flatnonzero(~chosen)
         columns = np.column_stack([conic.root[:, far], conic.root[:, near], conic.target])
         triangle = np.asarray(np.linalg.qr(columns, mode="r"))
-        blocks, rows = chosen[conic.variables].all(axis=1), ~conic.G[:, far].any(axis=1)
+        blocks = chosen[conic.variables].all(axis=1)
+        rows = ~conic.G[:, far].any(axis=1)
         return cls(near, far, np.asarray(blocks), np.asarray(rows), triangle)
 
     def marginal(self, conic: ConicProblem, gaussian: BarrierGaussian) -> tuple[ConicProblem, BarrierGaussian]:
         """The problem of the variables that chains sample, whatever the others are, and its Gaussian."""
-        place, first, last = np.zeros(len(conic.linear), dtype=np.int64), len(self.far), len(conic.linear)
+        place = np.zeros(len(conic.linear), dtype=np.int64)
+        first = len(self.far)
+        last = len(conic.linear)
         place[self.near] = np.arange(len(self.near))
         kept = np.concatenate([self.blocks, self.rows])
         problem = replace(
@@ -564,8 +591,10 @@ class _Split:
 
     def given(self, conic: ConicProblem) -> dict[str, Array]:
         """The Gaussian of the others given the former: mean `far_mean + far_gain @ near` and root of the covariance."""
-        first, last = len(self.far), len(conic.linear)
-        root, wanted = self.triangle[:first, :first], self.triangle[:first, first : last + 1]
+        first = len(self.far)
+        last = len(conic.linear)
+        root = self.triangle[:first, :first]
+        wanted = self.triangle[:first, first : last + 1]
         solved = scipy.linalg.solve_triangular(root, np.column_stack([wanted, np.eye(first)]))
         coupled, mean, far_root = np.split(solved, [last - first, last - first + 1], axis=1)
         return {"far_mean": mean[:, 0], "far_gain": -coupled, "far_root": far_root}

@@ -87,8 +87,8 @@ class Calibration:
         """
         if not self.changes_readings:
             return [log.every(step) for log in logs]
-        extras, tree = self.builder.extras, self._on_cpu.tree
-        return [calibrate_readings(log.every(step), extras, self._values_for(log), tree) for log in logs]
+        tree = self._on_cpu.tree
+        return [calibrate_readings(log.every(step), self.builder.extras, self._values_for(log), tree) for log in logs]
 
     def parameters(self, evaluation: Evaluation) -> Array:
         """Parameters as `Evaluation.metrics` takes them, (12 L + E,)."""
@@ -110,7 +110,8 @@ class Calibration:
 
     def _values_for(self, log: Block) -> Array:
         extras = self.builder.extras
-        values, own = self._known(extras, log.source), np.array([x.per_log for x in extras])
+        values = self._known(extras, log.source)
+        own = np.array([x.per_log for x in extras])
         if own.any() and not any(source == log.source for source, _ in self.values):
             if log.source not in self._of_new_logs:
                 self._of_new_logs[log.source] = self._fitted(log, values[~own])

@@ -69,7 +69,8 @@ def check_scale_groups(terms: ExtraTerms, robot: Robot, contacts: Sequence[Conta
     names = dict.fromkeys(CHANNELS, frames) | {"joint_torque": robot.joint_names}
     names |= dict.fromkeys(("ft_force", "ft_moment"), robot.ft_names)
     for kind, groups in _groups(terms).items():
-        field, group_of = f"sensors.scales.{kind}", dict[str, Sequence[str]]()
+        field = f"sensors.scales.{kind}"
+        group_of = dict[str, Sequence[str]]()
         for group in groups:
             for pattern in group:
                 if not _fitting(names[kind], pattern):
@@ -90,17 +91,19 @@ def stated_noise(config: NoiseConfig, robot: Robot) -> dict[str, Any]:
     """
     stated = config.forces
     if (torque := stated.get("joint_torque")) is not None:
-        key, names = "sensors.noise.joint_torque", robot.joint_names
-        stated["joint_torque"] = tuple(values_of_all(key, "noise", for_all(torque), "joint", names))
+        key = "sensors.noise.joint_torque"
+        stated["joint_torque"] = tuple(values_of_all(key, "noise", for_all(torque), "joint", robot.joint_names))
     require_comparable([float(x) for group in stated.values() for x in np.ravel(group)])
     return stated
 
 
 def require_comparable(noise: Sequence[float]) -> None:
     """Refuse standard deviations of forces by which float64 cannot weight rows. Raises InputError."""
-    low, high = min(noise, default=1.0), max(noise, default=1.0)
+    low = min(noise, default=1.0)
+    high = max(noise, default=1.0)
     if low < 1e-9 or high > min(1e6, 1e7 * low):
-        found, accepted = f"from {low:g} to {high:g}", "from 1e-9 to 1e6, the largest at most 1e7 times the smallest"
+        found = f"from {low:g} to {high:g}"
+        accepted = "from 1e-9 to 1e6, the largest at most 1e7 times the smallest"
         raise InputError.at_field("sensors.noise", f"standard deviations {found}", accepted)
 
 
@@ -111,7 +114,8 @@ def task_weights(config: TaskWeightsConfig, robot: Robot) -> Array | None:
         UnknownNameError: a pattern that no joint fits.
         ConfigError: a joint without a weight, where others have one, or with two; an axis of a fixed base.
     """
-    key, base = "estimator.task_weights", (config.base_force, config.base_moment)
+    key = "estimator.task_weights"
+    base = (config.base_force, config.base_moment)
     if robot.fixed_base and any(x is not None for x in base):
         raise ConfigError.at_field(key, "axes of the base, which is fixed", "joint_torque alone")
     torque = for_all(1.0 if config.joint_torque is None else config.joint_torque)
@@ -280,9 +284,11 @@ def suited_to_preprocessing(
         if robot.loops:
             found = f"set, for a robot with {format_count(len(robot.loops), 'closed loop')}"
             raise ConfigError.at_field("preprocessing.detect_contacts", found, "contact_threshold, or recorded flags")
-        touch, lift = settings.detect_contacts.touch, settings.detect_contacts.lift
+        touch = settings.detect_contacts.touch
+        lift = settings.detect_contacts.lift
         if lift > touch:
-            found, accepted = f"{lift:g}, above touch ({touch:g})", "a share of the weight up to that of touch"
+            found = f"{lift:g}, above touch ({touch:g})"
+            accepted = "a share of the weight up to that of touch"
             raise ConfigError.at_field("preprocessing.detect_contacts.lift", found, accepted)
     if settings.base_motion is not None:
         _require_floor(contacts)
@@ -363,7 +369,8 @@ class RobotSetup:
             InputError: as `stated_noise`.
         """
         stated = stated_noise(self.config.sensors.noise, self.robot)
-        delay, finds_tilt = self.config.actuators.delay or 0.0, self.config.robot.base_tilt == AUTO
+        delay = self.config.actuators.delay or 0.0
+        finds_tilt = self.config.robot.base_tilt == AUTO
         noise = SensorNoise.of_known(stated) if stated else None
         return Declared(noise, self.terms, delay, finds_tilt, self.config.sensors.on_base_lost == "warn")
 
@@ -375,11 +382,15 @@ class RobotSetup:
 
     def sensors_of(self, choice: ChoiceConfig) -> SensorSet:
         """The sensors of a choice. Raises InputError: names that do not fit the robot."""
-        robot, contacts, noise, ft = self.robot, self.contacts, self.noise, len(self.robot.ft_names)
+        robot = self.robot
+        contacts = self.contacts
+        noise = self.noise
+        ft = len(self.robot.ft_names)
         if choice.set is not None:
             sensors = named_sensors(choice.set, robot.n, len(contacts), noise, ft)
         else:
-            field, joints = "sensors.joint_torques", robot.joint_names
+            field = "sensors.joint_torques"
+            joints = robot.joint_names
             torques = [name for key in choice.joint_torques for name in matching_joints(field, key, joints)]
             sensors = chosen_sensors(joints, contacts, torques, choice.contact_wrenches, noise, ft)
         measured = with_ft_sensors(sensors, robot, choice.ft_sensors)
@@ -467,7 +478,8 @@ class RobotSetup:
         Raises:
             ConfigError: too few samples to leave some out.
         """
-        settings, ridges = self.config.estimator, RIDGES
+        settings = self.config.estimator
+        ridges = RIDGES
         if settings.ridge == AUTO:
             plain = LeastSquares(rank_tolerance=settings.rank_tolerance)
             with warnings.catch_warnings():
@@ -550,7 +562,8 @@ def set_up_robot(config: ExperimentConfig | AnalyzeConfig) -> RobotSetup:
     try:
         of = config.robot
         require_kind(of)
-        loops, joints = [loop.loop for loop in of.loops], _ft_joints(config)
+        loops = [loop.loop for loop in of.loops]
+        joints = _ft_joints(config)
         total = None if (mass := config.estimator.total_mass) is None else mass.value
         robot = load_robot(of.path, of.base_link, of.fixed_base, joints, of.weld, of.tilt, loops, of.passive, total)
     except UnknownNameError as error:

@@ -74,7 +74,8 @@ class RowModel:
             builder: of the rows.
             preprocessing: settings that samples depend on.
         """
-        tree, extras = builder.tree, builder.extras
+        tree = builder.tree
+        extras = builder.extras
         labels = {
             kind: [f"{x.label}, {'by log' if x.per_log else 'of all logs'}" for x in extras if x.what == kind]
             for kind in ("offset", "scale")
@@ -132,7 +133,8 @@ def require_same_rows(path: object, found: RowModel, expected: RowModel, referen
         LogError: names the setting, its value and the accepted one.
     """
     for key in (*expected.settings, *(key for key in found.settings if key not in expected.settings)):
-        one, other = found.settings.get(key), expected.settings.get(key)
+        one = found.settings.get(key)
+        other = expected.settings.get(key)
         if one != other:
             raise LogError(path, key, *_texts(one, other, reference))
     if found.noise.keys() != expected.noise.keys():
@@ -229,7 +231,8 @@ def _pack(parts: Sequence[Part], supports: dict[tuple[int, ...], int], values: l
     """The documents of some parts, as `_Part` has them; adds to the columns that they name, and to all numbers."""
     out: list[dict[str, object]] = []
     for part in parts:
-        blocks, noise_gram = part.factor.blocks, part.factor.noise_gram
+        blocks = part.factor.blocks
+        noise_gram = part.factor.noise_gram
         numbers = [supports.setdefault(support, len(supports)) for support in (*blocks, *noise_gram)]
         for block in (*blocks.values(), *noise_gram.values()):
             rows = block.cpu().numpy()
@@ -253,11 +256,15 @@ class _PartReader:
 
     def __init__(self, source: str, description: _Description, values: Array) -> None:
         settings = description.settings
-        columns, contacts = settings.get("columns"), settings.get("contacts")
+        columns = settings.get("columns")
+        contacts = settings.get("contacts")
         if not isinstance(columns, int) or columns < 1 or not isinstance(contacts, list):
             raise ValueError("neither columns nor contacts")
-        self._source, self._values, self._taken = source, values, 0
-        self._columns, self._contacts = columns, len(contacts)
+        self._source = source
+        self._values = values
+        self._taken = 0
+        self._columns = columns
+        self._contacts = len(contacts)
         self._supports = [tuple(support) for support in description.supports]
         if any(len(set(x)) != len(x) or max(x, default=0) >= columns for x in self._supports):
             raise ValueError(f"columns that are not among {columns}")
@@ -443,7 +450,8 @@ def _require_suffix(path: Path) -> None:
 def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
     """The description, and the numbers of all triangles."""
     log = factors.log
-    supports, values = dict[tuple[int, ...], int](), list[Array]()
+    supports = dict[tuple[int, ...], int]()
+    values = list[Array]()
     description = {
         "format": FORMAT,
         "torchid": factors.version,
@@ -508,7 +516,8 @@ def _array(container: Container, name: str, dtype: type, dimensions: int | None 
 
 def _log(source: str, description: _Description, values: Array) -> CompressedLog:
     """The compressed log; ValueError if it cannot be one."""
-    samples, blocks = description.samples, description.blocks
+    samples = description.samples
+    blocks = description.blocks
     parts = _PartReader(source, description, values)
     pieces = [parts.read(one) for one in description.pieces]
     by_state = [parts.read(one) for one in description.by_state]
@@ -593,7 +602,9 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
             on_read(path)
     _require_different_logs(paths, files)
     _require_stated_noise(experiment, files[0].model, paths[0])
-    used, origins, groups = files[0].model.noise, files[0].noise_origins, NoiseGroups.of(experiment.robot)
+    used = files[0].model.noise
+    origins = files[0].noise_origins
+    groups = NoiseGroups.of(experiment.robot)
     noise = groups.noise(groups.values(experiment.noise) | used, experiment.noise)
     listed = [GroupNoise(name, groups.unit(name), origins.get(name, "stated"), x, None) for name, x in used.items()]
     summary = NoiseSummary(noise, listed, {}, 0)
@@ -602,7 +613,8 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
 
 def with_choices_of(model: RowModel, experiment: Experiment) -> Experiment:
     """The experiment with what `torchid compress` has chosen where it leaves that to the logs."""
-    settings, config = model.settings, experiment.config
+    settings = model.settings
+    config = experiment.config
     labels = settings.get("actuators")
     kinds = {label.partition(" of ")[0] for label in labels} if isinstance(labels, list) else set[str]()
     found: dict[str, Any] = {name: in_words(name) in kinds for name in ACTUATORS if name != "stribeck"}
@@ -653,8 +665,8 @@ def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) 
 
 def _require_stated_noise(experiment: Experiment, model: RowModel, path: Path) -> None:
     """Refuse an experiment that states other noise than factors were weighted with."""
-    used, stated = model.noise, NoiseGroups.of(experiment.robot).values(experiment.noise)
-    for name, value in used.items():
+    stated = NoiseGroups.of(experiment.robot).values(experiment.noise)
+    for name, value in model.noise.items():
         if noise_key(name) in experiment.config.sensors.noise.forces and abs(value - stated[name]) > 1e-9 * value:
             found = f"{stated[name]:g}, but {value:g} in {path}"
             accepted = f"{value:g}, or no such key, or the logs compressed with another"

@@ -145,20 +145,21 @@ class LogFitter:
         nominal total mass stands in for one: the best fit were no forces at all. `reading_noise`: as `Assembly` has it.
         """
         assembly = assemble(parts, self.builder, self.robot, self.friction, reading_noise)
-        problem, known, data = assembly.problem, assembly.if_known, None
+        problem = assembly.problem
+        known = assembly.if_known
+        data = None
         if self.frozen is not None:
             problem, known = (replace(x, free=x.free & ~self.frozen) for x in (problem, known))
-        masses, homogeneous, scaled_by = (
-            self.masses,
-            bool(self.builder.extras) and _is_homogeneous(problem, assembly.forces),
-            None,
-        )
+        masses = self.masses
+        homogeneous = bool(self.builder.extras) and _is_homogeneous(problem, assembly.forces)
+        scaled_by = None
         if homogeneous and not masses:
             weights = mass_weights(len(self.robot.bodies))
             scaled_by = float(weights @ problem.nominal)
             masses = (KnownMass(TOTAL, weights, scaled_by),)
         if masses:
-            data, noise = problem, np.sqrt(problem.oversampling) * self.least_squares.solve(problem).residual_std
+            data = problem
+            noise = np.sqrt(problem.oversampling) * self.least_squares.solve(problem).residual_std
             problem, known = (with_known_masses(x, masses, noise, homogeneous) for x in (problem, known))
         known_of = {"stated": len(masses), "data": data, "scaled_by": scaled_by, "homogeneous": homogeneous}
         return replace(assembly, problem=problem, if_known=known, **known_of)  # type: ignore[arg-type]
@@ -190,7 +191,8 @@ class LogFitter:
 
         Rows are weighted with the noise of forces, which is that of readings times their scales.
         """
-        fit, left = self.solve_problem(problem, self.least_squares.solve), 0.0
+        fit = self.solve_problem(problem, self.least_squares.solve)
+        left = 0.0
         no_readings = dict.fromkeys(scale_columns(self.builder), 0.0)
         for log in {part.source: None for part in problem.parts}:
             at = np.append(fit.columns(self.builder, log).cpu().double().numpy(), -1.0)

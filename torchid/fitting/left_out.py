@@ -117,7 +117,8 @@ class Reading:
         """Change of the bodies' parameters per unit of each scale of a sensor, (J, P), in units of the prior."""
         scales = [k for k, extra in enumerate(self.extras) if extra.what == "scale"]
         others = [k for k in range(len(self.extras)) if k not in scales]
-        gram, count = self.grams.sum(0), len(self.nominal) - len(self.extras)
+        gram = self.grams.sum(0)
+        count = len(self.nominal) - len(self.extras)
         columns, normal = self._normal(gram, ridge * float(self.rows.sum()), others)
         at = [count + k for k in scales]
         return np.asarray(-np.linalg.solve(normal, columns.T @ gram[:-1, at])[: self.spread.shape[1]].T)
@@ -133,7 +134,8 @@ class Reading:
         """
         judged = judged or self
         fitted = [number for number, extra in enumerate(self.extras) if kind_of(extra) in terms]
-        squares, at_floor = np.empty(len(judged.rows)), _EXACT * judged.grams[:, -1, -1].sum() / len(judged.rows)
+        squares = np.empty(len(judged.rows))
+        at_floor = _EXACT * judged.grams[:, -1, -1].sum() / len(judged.rows)
         for fold in range(_FOLDS):
             kept = np.arange(len(self.rows)) % _FOLDS != fold
             weight = ridge * self.noise_variance * self.rows[kept].sum()
@@ -144,7 +146,8 @@ class Reading:
 
     def in_columns_of(self, other: Reading) -> Reading:
         """The same rows in the columns of a reading that has all extra parameters of this one, and more."""
-        count, labels = len(other.nominal) - len(other.extras), [extra.label for extra in other.extras]
+        count = len(other.nominal) - len(other.extras)
+        labels = [extra.label for extra in other.extras]
         own = (count + labels.index(extra.label) for extra in self.extras)
         at = np.array([*range(count), *own, len(other.nominal)])
         grams = np.zeros((len(self.rows), *other.grams.shape[1:]))
@@ -168,7 +171,8 @@ def gain_deviations(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerm
         terms: extra parameters of these.
         gain: standard deviation of the gains, 0.02 for 2 %.
     """
-    robot, count = fitter.robot, fitter.robot.nominal.size
+    robot = fitter.robot
+    count = fitter.robot.nominal.size
     if not (gain and len(logs) and fitter.builder.sensors.torque[: robot.n].any()) or "joint_torque" in terms.scales:
         return np.zeros((0, count))
     wide = with_terms(fitter, replace(terms, scales={**terms.scales, "joint_torque": "all"}))
@@ -197,20 +201,24 @@ def compress_reading(
         fitter: of their rows.
         gain: as in `Reading`.
     """
-    builder, robot = fitter.builder, fitter.robot
+    builder = fitter.builder
+    robot = fitter.robot
     spans = [list(zip(*_ends(log, edges[log.source]), strict=True)) for log in logs]
     first = dict(zip(edges, np.cumsum([0, *(len(x) - 1 for x in edges.values())]).tolist(), strict=False))
     count = sum(len(x) - 1 for x in edges.values())
-    grams, rows = np.zeros((count, builder.width + 1, builder.width + 1)), np.zeros(count)
+    grams = np.zeros((count, builder.width + 1, builder.width + 1))
+    rows = np.zeros(count)
     for part in compress_parts(in_blocks(logs, spans), builder):
         block = first[part.source] + part.block
         rows[block] += part.factor.rows
         for support, x in part.factor.blocks.items():
-            at, own = [*support, builder.width], x.cpu().double().numpy()
+            at = [*support, builder.width]
+            own = x.cpu().double().numpy()
             grams[block][np.ix_(at, at)] += own.T @ own
     prior = column_prior(builder, robot, fitter.friction)
     free = np.ones(prior.spread.shape[1], dtype=bool) if fitter.frozen is None else ~fitter.frozen
-    nominal, spread = np.zeros(builder.width), np.zeros((builder.width, int(free.sum())))
+    nominal = np.zeros(builder.width)
+    spread = np.zeros((builder.width, int(free.sum())))
     nominal[: builder.columns.count] = prior.nominal
     in_file = {"armature": robot.armature, "stiffness": robot.stiffness}  # of an MJCF robot
     for number, extra in enumerate(builder.extras, builder.columns.count):
@@ -232,7 +240,8 @@ def _eliminated(gram: Array, own: Sequence[int], rest: Sequence[int]) -> Array:
 
 def thinned(logs: Sequence[Samples], count: int = SAMPLES) -> list[Samples]:
     """About so many samples of all logs, evenly spaced, with the rate of the torques as the column of a delay."""
-    step, out = max(1, sum(map(len, logs)) // count), []
+    step = max(1, sum(map(len, logs)) // count)
+    out = []
     for log in logs:
         some: dict[str, object] = {"folder": None, "motion_noise": None, "unloaded": None}
         if log.torque is not None and len(log) > 1:
@@ -245,7 +254,8 @@ def thinned(logs: Sequence[Samples], count: int = SAMPLES) -> list[Samples]:
 
 def block_edges(logs: Sequence[Samples]) -> dict[str, Array]:
     """Times between which the blocks of each log lie [s], by its source: some `_BLOCKS` in all, fewer of short logs."""
-    total, independent = max(sum(map(len, logs)), 1), sum(len(log) / log.oversampling for log in logs)
+    total = max(sum(map(len, logs)), 1)
+    independent = sum(len(log) / log.oversampling for log in logs)
     blocks = min(_BLOCKS, int(independent / _LEAST_PER_BLOCK))
     counts = (max(1, round(blocks * len(log) / total)) for log in logs)
     ends = (
@@ -321,7 +331,9 @@ def leave_sensors_out(
 
     Source: sensors that make predictions worse, Mistry, Schaal, Yamane 2009, IV-E; the score is that of `choose_terms`.
     """
-    some, of, out = thinned(logs), fitter.builder, dict[str, Evidence]()
+    some = thinned(logs)
+    of = fitter.builder
+    out = dict[str, Evidence]()
     edges = block_edges(some)
     whole = compress_reading(some, edges, fitter)
     kinds = {kind_of(extra) for extra in whole.extras}
@@ -403,7 +415,8 @@ def widest(readings: Sequence[Reading], terms: Collection[str]) -> int:
     own = [one.left_out(terms, None, ridge) for one, ridge in zip(readings, ridges, strict=True)]
     for number, one in enumerate(readings[:-1]):
         for other in range(number + 1, len(readings)):
-            here, there = one.left_out(terms, readings[other], ridges[number]), readings[other]
+            here = one.left_out(terms, readings[other], ridges[number])
+            there = readings[other]
             of_both = Evidence.of(own[number] * here, own[other] * there.left_out(terms, one, ridges[other]))
             if of_both.certain and of_both.gain > _WORSE:
                 break
@@ -417,7 +430,8 @@ def widest(readings: Sequence[Reading], terms: Collection[str]) -> int:
 
 def with_all_readings(log: Samples, builder: RowBuilder) -> Samples:
     """The samples of a log that have every reading of the builder's sensors."""
-    sensors, known = builder.sensors, torch.ones(len(log), dtype=torch.bool)
+    sensors = builder.sensors
+    known = torch.ones(len(log), dtype=torch.bool)
     if sensors.torque.any():
         known &= torch.isfinite(builder.recorded_torque(log)[:, torch.from_numpy(sensors.torque)]).all(1)
     needed = torch.from_numpy(recorded_components(builder.contacts, sensors, log.wrench_in_world))
@@ -445,8 +459,10 @@ def sum_residuals(
     by_source = {log.source: log for log in reversed(logs)}
     sums = np.zeros((len(calibrations), 4))
     for part in parts:
-        R, log = part.factor.triangle(), by_source[part.source]
-        measured, rows = float(R[:, -1] @ R[:, -1]), part.factor.rows
+        R = part.factor.triangle()
+        log = by_source[part.source]
+        measured = float(R[:, -1] @ R[:, -1])
+        rows = part.factor.rows
         for number, one in enumerate(calibrations):
             residual = R[:, :-1] @ one.columns(builder, log).cpu() - R[:, -1]
             sums[number] += float(residual @ residual), measured, rows * log.noise_left, rows
@@ -596,7 +612,8 @@ def choose_ridge(
         for (fold, first), found in zip(shares, share_between_processes(shares, held_out, thread_count()), strict=True):
             squares[folds.index(fold), first::count] = found
     means = squares.mean(axis=0)
-    best, ridges = int(means.argmin()), tuple(float(estimator.ridge) for estimator in estimators)
+    best = int(means.argmin())
+    ridges = tuple(float(estimator.ridge) for estimator in estimators)
     error = (squares - squares[:, [best]]).std(axis=0, ddof=1) / np.sqrt(len(folds))
     near = np.flatnonzero(means - means.min() <= error)
     taken = int(near[-1] if rule == "one_standard_error" else near[0])
@@ -613,7 +630,8 @@ def _held_out_squares(
 ) -> Array:
     """Mean squares on a fold of what each estimator fits without it."""
     assembly = fitter.build_problem([part for part in parts if part.fold != fold]).assembly
-    logs, own = [x for x in blocks if x.fold == fold], [x for x in parts if x.fold == fold]
+    logs = [x for x in blocks if x.fold == fold]
+    own = [x for x in parts if x.fold == fold]
     fitted = []
     for estimator in estimators:
         found = estimator.minimize(assembly.problem)
@@ -642,7 +660,8 @@ class Scorer:
     def scored(self, logs: Sequence[Block]) -> tuple[int, int]:
         """Of training logs: k so that every k-th sample of each is scored, and the number of these."""
         whole = [log for log in logs if isinstance(log, Samples)]
-        lengths, alike = [len(log) for log in whole], min((log.oversampling for log in whole), default=1.0)
+        lengths = [len(log) for log in whole]
+        alike = min((log.oversampling for log in whole), default=1.0)
         step = max(1, -(-sum(lengths) // self.most), min(int(alike), sum(lengths) // ENOUGH_SCORED))
         while step < max(lengths, default=1) and sum(-(-length // step) for length in lengths) > self.most:
             step += 1  # each log has a first sample

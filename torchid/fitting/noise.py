@@ -112,7 +112,8 @@ def estimate_noise(
         stated: fields of `SensorNoise` that are stated.
         suggest: whether to find what residuals show of what is stated; without it, nothing is fitted if all is.
     """
-    builder, guess = fitter.builder, fitter.builder.sensors.noise
+    builder = fitter.builder
+    guess = fitter.builder.sensors.noise
     stds = noise_of_sensors(builder)
     if not suggest and all(noise_key(name) in stated for name in stds):
         groups = [GroupNoise(name, builder.noise_groups.unit(name), "stated", std, None) for name, std in stds.items()]
@@ -121,8 +122,11 @@ def estimate_noise(
     if not (rows.groups and rows.chunks):
         return NoiseSummary(guess, [], {}, 0)
     tied = [name for name in rows.groups if noise_key(name) in stated]
-    variance, columns, passes = np.ones(len(rows.groups)), None, 0
-    components, homogeneous = GroupVariances.unknown(len(rows.groups)), False
+    variance = np.ones(len(rows.groups))
+    columns = None
+    passes = 0
+    components = GroupVariances.unknown(len(rows.groups))
+    homogeneous = False
     estimator = VarianceComponentEstimator(rows, tied)
     while True:
         columns, directions, homogeneous = _fit_rows(rows, variance, columns, fitter)
@@ -400,7 +404,8 @@ def force_gain(problem: LinearProblem) -> float | None:
     inertial[:, parameters.INERTIAL] = True
     chosen = inertial.flatten()
     needed = problem.A[:, chosen] @ problem.nominal[chosen]
-    free, fixed = ~chosen & problem.free, ~chosen & ~problem.free
+    free = ~chosen & problem.free
+    fixed = ~chosen & ~problem.free
     measured = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
     U, values, _ = np.linalg.svd(problem.A[:, free] * problem.scale[free], full_matrices=False)
     friction = U[:, is_significant(values)]
@@ -501,7 +506,8 @@ def unfitted_friction(problem: LinearProblem, robot: Robot) -> UnfittedFriction 
         robot: with the joints.
     """
     joints = {body: part.joint for body, part in enumerate(robot.bodies) if part.joint is not None}
-    free, A = problem.free.reshape(-1, PER_BODY), problem.A.reshape(len(problem.A), -1, PER_BODY)[:, :, FRICTION]
+    free = problem.free.reshape(-1, PER_BODY)
+    A = problem.A.reshape(len(problem.A), -1, PER_BODY)[:, :, FRICTION]
     bodies = [body for body in joints if free[body, INERTIAL].any() and not free[body, FRICTION].any()]
     bodies = [body for body in bodies if A[:, body].any(axis=0).all()]
     if not bodies:
@@ -514,12 +520,14 @@ def unfitted_friction(problem: LinearProblem, robot: Robot) -> UnfittedFriction 
     rows -= U @ (U.T @ rows)
     V, values, Wh = np.linalg.svd(rows[:, :-1], full_matrices=False)
     kept = values > UNOBSERVABLE_SHARE
-    explained, rank = V[:, kept].T @ rows[:, -1], int(kept.sum())
+    explained = V[:, kept].T @ rows[:, -1]
+    rank = int(kept.sum())
     left = rows[:, -1] - V[:, kept] @ explained
     cost = float(left @ left) + problem.residual
     noise = problem.oversampling * residual_std(cost, problem.rows, U.shape[1] + rank, problem.oversampling) ** 2
     inverse = Wh[kept].T / values[kept]
-    found, deviation = inverse @ explained, np.maximum(np.linalg.norm(inverse, axis=1), np.finfo(float).tiny)
+    found = inverse @ explained
+    deviation = np.maximum(np.linalg.norm(inverse, axis=1), np.finfo(float).tiny)
     order = np.argsort(-np.square(found / deviation).reshape(-1, 2).sum(axis=1))
     shown = [joints[bodies[index]] for index in order]
     return UnfittedFriction(

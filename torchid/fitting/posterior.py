@@ -85,12 +85,14 @@ def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPo
         robot: for names.
         conditions: that samples are to meet.
     """
-    problem, estimate = fit.assembly.problem, fit.estimate
+    problem = fit.assembly.problem
+    estimate = fit.estimate
     noise = math.sqrt(problem.oversampling) * estimate.residual_std
     deviations = None if fit.jackknife is None else fit.jackknife.without_ridge[: fit.jackknife.blocks]
     reported = np.vstack([np.eye(len(problem.nominal)), mass_weights(len(robot.bodies))])
     A, b = whitened_rows(problem, noise, deviations, reported)
-    D, extras = np.zeros((len(A), 0)), []
+    D = np.zeros((len(A), 0))
+    extras = []
     for one in fit.assembly.eliminations:
         if one.log:
             continue
@@ -138,12 +140,13 @@ def _scale_of_prior(scale: Array, moved: Array) -> Array:
 
 def posterior_arrays(fitted: FittedPosterior) -> dict[str, NDArray[Any]]:
     """What the file of a posterior holds, by name."""
-    posterior, conditions = fitted.posterior, fitted.posterior.conditions
+    conditions = fitted.posterior.conditions
     lower, upper = conditions.bounds(len(fitted.body_names))
-    enclosures, mirrors = conditions.enclosures, conditions.mirrors
+    enclosures = conditions.enclosures
+    mirrors = conditions.mirrors
     return {
         "format": np.array(_FORMAT),
-        **{name: np.asarray(getattr(posterior, name)) for name in _NUMBERS},
+        **{name: np.asarray(getattr(fitted.posterior, name)) for name in _NUMBERS},
         **{name: np.array(getattr(fitted, name), dtype=np.str_) for name in _TEXTS},
         "margin": np.array(conditions.margin),
         "total_mass": np.array(np.nan if conditions.total_mass is None else conditions.total_mass),
@@ -191,7 +194,8 @@ def _posterior(arrays: Mapping[str, NDArray[Any]]) -> FittedPosterior:
     if arrays["format"].shape != () or int(arrays["format"]) != _FORMAT:
         raise ValueError("of another version of torchid")
     texts = {name: tuple(str(x) for x in arrays[name].reshape(-1)) for name in _TEXTS}
-    bodies, extras = len(texts["body_names"]), len(texts["extra_names"])
+    bodies = len(texts["body_names"])
+    extras = len(texts["extra_names"])
     shapes = {"D": (-1, extras), "b": (-1,), "extra_size": (extras,), "extra_lower": (extras,), "A": (-1, 12 * bodies)}
     numbers = {name: _numbers(arrays, name, shapes.get(name, (PER_BODY * bodies,))) for name in _NUMBERS}
     if not (len(numbers["A"]) == len(numbers["D"]) == len(numbers["b"])):
@@ -331,7 +335,8 @@ class PosteriorSampler(torch.nn.Module):
         if prior_error != "auto" and not (isinstance(prior_error, (int, float)) and 0.0 < prior_error < math.inf):
             raise InputError("sampler", "prior_error", f"{prior_error}", "a number above 0, or 'auto'")
         self.fitted = run if isinstance(run, FittedPosterior) else read_posterior(Path(run))
-        posterior, prior_error = self.fitted.posterior, self.fitted.prior_error(prior_error)
+        posterior = self.fitted.posterior
+        prior_error = self.fitted.prior_error(prior_error)
         conic = posterior.conic_problem(prior_error)
         self.draws = TruncatedGaussian(conic, posterior.owners())
         count = int(posterior.free.sum())
@@ -447,7 +452,8 @@ class RigidPlusResidual(nn.Module):
         """
         try:
             state = torch.load(path, weights_only=True)
-            phi, own = state["phi"].numpy(), state["residual"]
+            phi = state["phi"].numpy()
+            own = state["residual"]
             residual = residual or JointNetworks(robot.n, own["out"].shape[1])
             residual.load_state_dict(own)
             if phi.shape != (robot.nominal.size,) or not np.isfinite(phi).all():

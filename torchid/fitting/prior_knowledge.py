@@ -65,7 +65,8 @@ def _enclosures(settings: EstimatorConfig, robot: Robot) -> tuple[Enclosure, ...
     if not extents:
         found = f"{settings.com_inside}, but {robot.path.name} says of no body that is fitted what shape it has"
         raise ConfigError.at_field("estimator.com_inside", found, f"null, or a {robot.format} with shapes")
-    out, outside = [], []
+    out = []
+    outside = []
     for body, extent in extents.items():
         half = extent.half if settings.com_inside == "box" else extent.semi_axes
         out.append(Enclosure(body, settings.com_inside, extent.centre, extent.axes, half))
@@ -96,7 +97,8 @@ def _bounds(settings: EstimatorConfig, robot: Robot) -> tuple[Array | None, Arra
     exact = {name: mass.value for name, mass in settings.masses.items() if not mass.std and name in robot.body_names}
     if not (settings.bounds or exact):
         return None, None
-    lower, upper = np.full(robot.nominal.shape, -np.inf), np.full(robot.nominal.shape, np.inf)
+    lower = np.full(robot.nominal.shape, -np.inf)
+    upper = np.full(robot.nominal.shape, np.inf)
     for name, mass in exact.items():
         lower[robot.body_names.index(name), parameters.MASS] = mass
         upper[robot.body_names.index(name), parameters.MASS] = mass
@@ -108,7 +110,8 @@ def _bounds(settings: EstimatorConfig, robot: Robot) -> tuple[Array | None, Arra
             field = f"estimator.bounds.{name}"
             if parameter not in PARAMETERS:
                 raise UnknownNameError.at_field(field, parameter, PARAMETERS)
-            number, field = PARAMETERS.index(parameter), f"{field}.{parameter}"
+            number = PARAMETERS.index(parameter)
+            field = f"{field}.{parameter}"
             _check_fitted(settings, robot, body, parameter, field)
             _check_interval(parameter, low, high, field)
             lower[body, number] = -np.inf if low is None else low
@@ -118,7 +121,8 @@ def _bounds(settings: EstimatorConfig, robot: Robot) -> tuple[Array | None, Arra
 
 def _check_fitted(settings: EstimatorConfig, robot: Robot, body: int, parameter: str, field: str) -> None:
     """Refuse a bound on what stays as it is in the URDF."""
-    name, friction = robot.body_names[body], parameter in _FRICTION
+    name = robot.body_names[body]
+    friction = parameter in _FRICTION
     if name in settings.frozen:
         raise ConfigError.at_field(field, "a bound on a body that is frozen", "one of the two")
     if friction and robot.bodies[body].joint is None:
@@ -246,7 +250,8 @@ def with_known_masses(
     A, b, rows, values = _eliminated(problem, kept, noise)
     uncertain = [mass for mass in masses if mass not in kept]
     if uncertain:
-        free, scale = problem.free, problem.scale[problem.free]
+        free = problem.free
+        scale = problem.scale[problem.free]
         weights, (equations, missing) = (
             noise / np.array([mass.std for mass in uncertain]),
             _equations(problem, uncertain),
@@ -269,14 +274,16 @@ def with_known_masses(
 
 def _eliminated(problem: LinearProblem, masses: Sequence[KnownMass], noise: float) -> tuple[Array, Array, Array, Array]:
     """A and b of a problem that depend on no deviation along some masses, and the rows and right-hand side of these."""
-    free, scale = problem.free, problem.scale[problem.free]
+    free = problem.free
+    scale = problem.scale[problem.free]
     rows = np.zeros((len(masses), len(free)))
     if not masses:
         return problem.A, problem.b, rows, np.zeros(0)
     equations, missing = _equations(problem, masses)
     Q, R = np.linalg.qr(equations.T)
     target = np.linalg.solve(R.T, missing) + Q.T @ (problem.nominal[free] / scale)  # along Q, orthonormal columns
-    scaled, A = problem.A[:, free] * scale, problem.A.copy()
+    scaled = problem.A[:, free] * scale
+    A = problem.A.copy()
     along = scaled @ Q
     A[:, free] -= along @ (Q.T / scale)
     weight = _WEIGHT * float(np.linalg.norm(scaled - along @ Q.T, 2))
@@ -288,7 +295,8 @@ def _eliminated(problem: LinearProblem, masses: Sequence[KnownMass], noise: floa
 
 def _equations(problem: LinearProblem, masses: Sequence[KnownMass]) -> tuple[Array, Array]:
     """Rows (k, P') and right-hand sides (k,) in scaled deviations of the free parameters from the nominal ones."""
-    free, scale = problem.free, problem.scale[problem.free]
+    free = problem.free
+    scale = problem.scale[problem.free]
     weights = np.array([mass.weights for mass in masses]).reshape(len(masses), len(free))
     missing = np.array([mass.value for mass in masses]) - weights @ problem.nominal
     return weights[:, free] * scale, missing

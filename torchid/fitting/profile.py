@@ -163,8 +163,10 @@ def choose_stribeck(
     log_best, fit, term = _gauss_newton(
         lambda x: _with_slope_of_velocity(thin, float(np.exp(x)), terms), math.log(_VELOCITIES[first]), (low, high)
     )
-    best, reach = math.exp(log_best), _QUANTILE * term.standard_error
-    low, high = best * np.exp(-reach), best * np.exp(reach)
+    best = math.exp(log_best)
+    reach = _QUANTILE * term.standard_error
+    low = best * np.exp(-reach)
+    high = best * np.exp(reach)
     at_rest = [x for x in fit.extras if x.extra.what == "stribeck"]
     significance = max((x.value / x.standard_error for x in at_rest if x.standard_error > 0.0), default=0.0)
     required = -NormalDist().inv_cdf(_AT_REST_CHANCE / max(len(at_rest), 1))
@@ -352,7 +354,8 @@ def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Tor
     Raises:
         LogError: the logs are too short for the delays that are tried.
     """
-    step, out = max(1, sum(map(len, logs)) // most), list[_Torques]()
+    step = max(1, sum(map(len, logs)) // most)
+    out = list[_Torques]()
     dofs = torch.from_numpy(np.flatnonzero(fitter.builder.sensors.torque[: fitter.robot.n]))
     for log in logs:
         time = log.time.numpy()
@@ -361,7 +364,8 @@ def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Tor
             continue
         oversampling = max(1.0, log.oversampling / step)
         samples = replace(log[torch.from_numpy(chosen)], oversampling=oversampling, folder=None, motion_noise=None)
-        recorded, splines = log.torque[:, dofs].numpy(), list[tuple[torch.Tensor, BSpline]]()
+        recorded = log.torque[:, dofs].numpy()
+        splines = list[tuple[torch.Tensor, BSpline]]()
         for segment in unbroken_segments(time):
             at = np.flatnonzero((chosen >= segment.start) & (chosen < segment.stop))
             if len(at):

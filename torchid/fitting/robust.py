@@ -202,7 +202,8 @@ def _passes(
         current = loss
         if loss.kind != "huber" and first_pass + found.done < _START:  # Huber's loss is convex
             current = replace(loss, kind="huber", tuning=TUNING["huber"])
-        at, scale = found.at, found.scale
+        at = found.at
+        scale = found.scale
         by_log = {source: at.columns(fitter.builder, source) for source in sources}
         reweighting = Reweighting(current, by_log, max(scale, _TINY))
         parts = compress(reweighting)
@@ -242,7 +243,8 @@ class Reweighting:
             parameters: by the source of a log, (width,) in the builder's columns.
             scale: of the whitened residuals of good rows.
         """
-        self.loss, self.scale = loss, scale
+        self.loss = loss
+        self.scale = scale
         self._parameters = parameters
         self._histogram = np.zeros(_BINS)
         self._terms: list[list[float]] = []  # rows, weights, rho'^2, rho'', rho''^2 of each chunk, as they come
@@ -254,7 +256,8 @@ class Reweighting:
         u = (rows[:, :-1] @ theta - rows[:, -1]) / self.scale
         weights = self.loss.weight(u).sqrt()[:, None]
         u = u if samples.resting is None else u[rows.any(1)]  # without those that a sample has not
-        weight, slope = self.loss.weight(u), self.loss.slope(u)
+        weight = self.loss.weight(u)
+        slope = self.loss.slope(u)
         digits = u.abs().log10().clamp(*_DECADES)
         counts = torch.histc(digits, _BINS, *_DECADES).cpu().numpy()
         sums = [len(u), *(float(x.sum()) for x in (weight, (weight * u).square(), slope, slope.square()))]
@@ -322,7 +325,8 @@ def _has_converged(fit: Fit, before: Fit, scale: float, new_scale: float) -> boo
 
     So it has where nothing but rounding remains to be fitted.
     """
-    problem, estimate = fit.assembly.problem, fit.estimate
+    problem = fit.assembly.problem
+    estimate = fit.estimate
     moved = problem.prediction_distance(estimate.phi, before.estimate.phi)
     if max(moved, new_scale) <= _EXACT * problem.prediction_distance(estimate.phi, np.zeros_like(estimate.phi)):
         return True
@@ -337,7 +341,8 @@ def _has_converged(fit: Fit, before: Fit, scale: float, new_scale: float) -> boo
 
 def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
     """The fit with standard errors of the loss, as if its rows were independent ones with these errors."""
-    estimate, problem = fit.estimate, fit.assembly.problem
+    estimate = fit.estimate
+    problem = fit.assembly.problem
     factor = reweighting.deviation(problem.oversampling * estimate.rank) / max(estimate.residual_std, _TINY)
     if not (np.isfinite(factor) and factor > 0.0):
         return fit

@@ -126,7 +126,8 @@ def choose_cutoff(
         for of_motion, of_noise, name in _powers(
             log, signal_noise(log, None, stated), candidates, base_is_derived, known
         ):
-            motion, noise = motion + of_motion, noise + of_noise
+            motion = motion + of_motion
+            noise = noise + of_noise
             if name in _OF_WEIGHT:
                 of_base += of_noise
                 gravity += float(log.time[-1] - log.time[0]) * GRAVITY**2
@@ -150,7 +151,8 @@ def _powers(
     """
     for name, every, std, order in _noisy_sources(log, noise, base_is_derived):
         measured = np.isfinite(every).all(axis=1)  # gaps, whose samples are left out later, are passed over
-        values, time = every[measured], log.time[measured]
+        values = every[measured]
+        time = log.time[measured]
         if len(time) < 2:
             continue
         rate = (len(time) - 1) / float(time[-1] - time[0])
@@ -181,7 +183,8 @@ def _with_coloured_noise(
     """
     edges = _LOWEST_HZ * 10.0 ** np.arange(0.0, np.log10(_TOP_SHARE * 2.0 * frequency[-1]), 1.0 / _BINS_PER_DECADE)
     starts = np.unique(np.searchsorted(frequency, edges))
-    lines, at = np.diff(starts), frequency[starts[:-1]]
+    lines = np.diff(starts)
+    at = frequency[starts[:-1]]
     density = np.add.reduceat(power[: starts[-1]], starts[:-1]) / lines
     floor = _ABOVE_NOISE * np.minimum.accumulate((density * at)[::-1])[::-1] / at
     more = np.cumsum((np.maximum(density - floor, 0.0) * lines)[::-1])[::-1] * frequency[1]

@@ -52,7 +52,8 @@ def dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timelin
     if timeline.low_pass is None and timeline.rest_speed is None:
         return out
     name = "joint_position" if log.joint_velocity is None else "joint_velocity"
-    known, wider = smoothed[name], timeline.sign_low_pass
+    known = smoothed[name]
+    wider = timeline.sign_low_pass
     if wider is not None:
         known = replace(timeline, low_pass=wider).smooth(getattr(log, name))
     if timeline.rest_speed is not None and log.joint_rests is None:
@@ -63,14 +64,16 @@ def dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timelin
 
 def _directions(known: FloatArray, are_positions: bool, timeline: Timeline, low_pass: LowPass) -> dict[str, FloatArray]:
     """Both directions by joint positions, or else velocities, (M, n), behind their filter."""
-    steps, means = np.diff(timeline.grid), dict[str, Callable[..., FloatArray]](joint_direction=mean_dry)
+    steps = np.diff(timeline.grid)
+    means = dict[str, Callable[..., FloatArray]](joint_direction=mean_dry)
     if timeline.stribeck is not None:
         means["joint_stribeck"] = partial(mean_stribeck, stribeck=timeline.stribeck)
     out = {key: np.empty((len(timeline.output_stamps), known.shape[1])) for key in means}
     together = channels_together(len(known))
     for start in range(0, known.shape[1], together):
         columns = slice(start, start + together)
-        width, x = noisy_width(timeline, columns), known[:, columns]
+        width = noisy_width(timeline, columns)
+        x = known[:, columns]
         halfway = np.diff(x, axis=0) / steps[:, None] if are_positions else 0.5 * (x[1:] + x[:-1])
         halfway = np.concatenate([halfway[:1], halfway, halfway[-1:]])
         for key, mean in means.items():
@@ -138,7 +141,8 @@ def with_sign_filter(timeline: Timeline, log: Log, noise: SignalNoise) -> Timeli
     Warns:
         TorchidWarning: the timeline's own filter takes off much of the joints' motion.
     """
-    wider, derivatives = wider_low_pass(log, timeline), noise.derivatives
+    wider = wider_low_pass(log, timeline)
+    derivatives = noise.derivatives
     if wider is not None:
         if wider.lost > _MUCH:
             with about_file(log.source):
@@ -147,12 +151,15 @@ def with_sign_filter(timeline: Timeline, log: Log, noise: SignalNoise) -> Timeli
         step = float(np.median(np.diff(log.time)))
         derivatives = noise_of_derivatives(step, replace(timeline, low_pass=wider.low_pass))
     name, order = ("joint_position", 1) if log.joint_velocity is None else ("joint_velocity", 0)
-    std, none = noise.std.get(name), np.zeros(len(log.joint_names))
+    std = noise.std.get(name)
+    none = np.zeros(len(log.joint_names))
     is_noisy = std is not None and bool(std.any()) and timeline.cutoff_hz is not None
     if not (is_noisy or timeline.finds_rest):
         return timeline
     of_sign = (none if std is None else std) * np.sqrt(derivatives[order, order])
-    of_position, step, noisy = noise.std.get("joint_position", none), float(np.median(np.diff(log.time))), of_sign > 0.0
+    of_position = noise.std.get("joint_position", none)
+    step = float(np.median(np.diff(log.time)))
+    noisy = of_sign > 0.0
     ratio = float(np.median(of_position[noisy] / of_sign[noisy])) if noisy.any() else 0.0
     lag = max(1, round(np.sqrt(2.0) * ratio / step))
     velocity = np.diff(log.joint_position[::lag], axis=0) / np.diff(log.time[::lag])[:, None]  # mean, over the lag
@@ -216,7 +223,8 @@ def wider_low_pass(log: Log, timeline: Timeline) -> WiderLowPass | None:
         log: as recorded.
         timeline: that it is preprocessed to.
     """
-    cutoff, low_pass = timeline.cutoff_hz, timeline.low_pass
+    cutoff = timeline.cutoff_hz
+    low_pass = timeline.low_pass
     start = log.select(slice(0, MOST_SAMPLES))
     if cutoff is None or low_pass is None or len(start) < max(_FEWEST, 2 * low_pass.padding):
         return None
@@ -264,7 +272,8 @@ def mean_tanh(velocity: FloatArray) -> FloatArray:
     """Likewise of the hyperbolic tangent, whose integral is log cosh."""
     size = np.abs(velocity)
     integral = np.diff(size + np.log1p(np.exp(-2.0 * size)), axis=0)
-    change, tanh = np.diff(velocity, axis=0), np.tanh(0.5 * (velocity[:-1] + velocity[1:]))
+    change = np.diff(velocity, axis=0)
+    tanh = np.tanh(0.5 * (velocity[:-1] + velocity[1:]))
     return np.divide(integral, change, out=tanh, where=np.abs(change) > _LEAST_CHANGE)
 
 
@@ -298,7 +307,9 @@ def mean_stribeck(velocity: FloatArray, width: float | FloatArray | None, stribe
         width: as of `mean_dry`.
         stribeck: v_s [rad/s or m/s].
     """
-    mean, before, after = mean_dry(velocity, width), velocity[:-1], velocity[1:]
+    mean = mean_dry(velocity, width)
+    before = velocity[:-1]
+    after = velocity[1:]
     for node, weight in zip(*leggauss(_NODES), strict=True):
         v = 0.5 * (before + after) + 0.5 * node * (after - before)
         sign = np.sign(v) if width is None else np.tanh(v / width)
