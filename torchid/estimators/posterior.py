@@ -15,6 +15,7 @@ from torchid.parallel import one_thread
 from torchid.parameters import FRICTION, INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.elimination import eliminate_columns
+from torchid.problem.linear import EliminatedTerms, SignCondition
 from torchid.reprs import short_repr
 from torchid.rounding import RANK_TOLERANCE, is_significant
 
@@ -35,7 +36,7 @@ class Posterior:
         free: (12 L,) bool; the others stay nominal.
         conditions: that parameters meet.
         extra_size: (S,), standard deviation of the extra parameters by the prior, whose mean is 0.
-        extra_lower: (S,), least values of the extra parameters, minus infinity where there are none.
+        extra_lower: (S,), 0 for extra parameters that are never negative, minus infinity for others.
     """
 
     A: Array
@@ -62,40 +63,32 @@ class Posterior:
         Raises:
             InputError: the conditions exclude each other.
         """
-        problem = LinearProblem(
-            np.zeros((0, len(self.nominal))), np.zeros(0), 0.0, 1, self.nominal, self.scale, self.free
+        bodies = len(self.nominal)
+        extras = len(self.extra_size)
+        never_negative = np.eye(extras)[np.isfinite(self.extra_lower)]
+        terms = EliminatedTerms(  # the prior of the extra parameters is further rows
+            C=np.concatenate([self.A, np.zeros((extras, bodies))]),
+            D=np.concatenate([self.D, np.diag(1.0 / self.extra_size)]),
+            z=np.append(self.b, np.zeros(extras)),
+            size=self.extra_size,
+            labels=("an extra parameter",) * extras,
+            conditions=tuple(
+                SignCondition("an extra parameter", unit, np.zeros(bodies), float(unit @ self.extra_size), "")
+                for unit in never_negative
+            ),
         )
-        prior = build_conic_problem(problem, self.conditions, prior_error**-2, "pullback", self._metric())
-        return self._with_data(prior)
+        no_rows = np.zeros((0, bodies))
+        problem = LinearProblem(no_rows, np.zeros(0), 0.0, 1, self.nominal, self.scale, self.free, terms=terms)
+        conic = build_conic_problem(problem, self.conditions, prior_error**-2, "pullback", self._metric())
+        size = len(conic.linear)
+        triangle = np.asarray(np.linalg.qr(np.column_stack([conic.root, conic.target]), mode="r"))
+        constant = conic.constant + float(np.square(triangle[size:, size]).sum())
+        return replace(conic, root=triangle[:size, :size], target=triangle[:size, size], constant=constant)
 
     def owners(self) -> np.ndarray:
         """The body that each variable of the conic problem belongs to, (n,) int; extra parameters are on their own."""
         own = len(self.nominal) // PER_BODY + np.arange(len(self.extra_size))
         return np.concatenate([np.flatnonzero(self.free) // PER_BODY, own])
-
-    def _with_data(self, prior: ConicProblem) -> ConicProblem:
-        """The problem of the prior alone with the data, and with the extra parameters as further variables."""
-        count = int(self.free.sum())
-        extras = len(self.extra_size)
-        by_free = (self.A[:, self.free] * self.scale[self.free]) @ prior.deviations
-        root = np.concatenate([by_free, prior.root, np.zeros((extras, count))])
-        of_extras = np.concatenate([self.D * self.extra_size, np.zeros((len(prior.root), extras)), np.eye(extras)])
-        target = np.concatenate([self.b - self.A @ self.nominal, prior.target, np.zeros(extras)])
-        triangle = np.asarray(np.linalg.qr(np.column_stack([root, of_extras, target]), mode="r"))
-        size = count + extras
-        bounded = np.isfinite(self.extra_lower)
-        return replace(
-            prior,
-            root=triangle[:size, :size],
-            target=triangle[:size, size],
-            linear=np.zeros(size),
-            constant=prior.constant + float(np.square(triangle[size:, size]).sum()),
-            G=scipy.linalg.block_diag(prior.G, np.eye(extras)[bounded]),
-            h=np.concatenate([prior.h, (self.extra_lower / np.maximum(self.extra_size, 1e-300))[bounded]]),
-            E=np.column_stack([prior.E, np.zeros((len(prior.E), extras))]),
-            names=(*prior.names, *["an extra parameter"] * int(bounded.sum())),
-            deviations=scipy.linalg.block_diag(prior.deviations, np.eye(extras)),
-        )
 
     @property
     def _thinnest(self) -> float:

@@ -202,6 +202,8 @@ def _posterior(arrays: Mapping[str, NDArray[Any]]) -> FittedPosterior:
         raise ValueError("A, D and b have different numbers of rows")
     if not ((numbers["scale"] > 0.0).all() and (numbers["extra_size"] > 0.0).all()):
         raise ValueError("scale or extra_size is not positive")
+    if not np.isin(numbers["extra_lower"], (0.0, -np.inf)).all():
+        raise ValueError("extra_lower is neither 0 nor minus infinity")
     total = float(arrays["total_mass"])
     conditions = Conditions(
         margin=float(arrays["margin"]),
