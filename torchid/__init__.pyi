@@ -38,10 +38,6 @@ from .estimators import (
     nearest_consistent,
     violations,
 )
-from .fitting.calibration import (
-    Calibration,
-    calibrations,
-)
 from .fitting.factor_files import (
     FactorFile,
     RowModel,
@@ -51,7 +47,9 @@ from .fitting.factor_files import (
     write_factors,
 )
 from .fitting.fit import (
+    Calibration,
     LogFitter,
+    calibrations,
     frozen_parameters,
 )
 from .fitting.left_out import (

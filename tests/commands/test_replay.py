@@ -16,7 +16,7 @@ from torchid.cli import main
 from torchid.commands.folder import REPLAY, read_manifest
 from torchid.commands.replay import PARAMETER_SAMPLES, Replay, _feet, replay
 from torchid.errors import ConfigError
-from torchid.fitting.calibration import Comparison
+from torchid.fitting.fit import Comparison
 from torchid.report.figures import drift_figure
 from torchid.sensing import Contact
 from torchid.simulation.replay import Drift

@@ -15,7 +15,7 @@ from recordings import Miscalibration
 from unknowns import fit
 from welded import CONTACTS
 
-from torchid.fitting.calibration import warn_of_masked
+from torchid.fitting.fit import warn_of_masked
 from torchid.logs import Log
 from torchid.logs.preprocess import UNLOADED_MARGIN_S, find_unloaded, preprocess
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts

@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from torchid.estimators.least_squares import COMBINED, FIXED
-from torchid.fitting.calibration import Comparison
+from torchid.fitting.fit import Comparison
 from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import ROW_GROUPS

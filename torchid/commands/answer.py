@@ -13,7 +13,7 @@ from torchid.config.logs import tests_on_seen_samples
 from torchid.errors import format_count, format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.least_squares import IDENTIFIED
-from torchid.fitting.calibration import Confounded, list_confounded
+from torchid.fitting.fit import Confounded, list_confounded
 from torchid.fitting.noise import AT_THE_FLOOR, unexplained_joints
 from torchid.fitting.posterior import FittedPosterior
 from torchid.log_checks.contacts import MAX_MASS_ERROR

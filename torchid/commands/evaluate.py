@@ -19,8 +19,8 @@ from torchid.commands.run_folder import Identification, force_figures
 from torchid.config import load_config
 from torchid.config.robot import NoiseConfig
 from torchid.errors import ConfigError, about_file, during, warn
-from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.experiment import Experiment, require_device, set_up, stated_noise, with_estimated_noise
+from torchid.fitting.fit import Calibration, Comparison
 from torchid.fitting.left_out import Scorer
 from torchid.fitting.posterior import RESIDUAL, RigidPlusResidual
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes

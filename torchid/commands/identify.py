@@ -23,10 +23,17 @@ from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import ConfigError, NumericalWarning, warn_about_file
 from torchid.estimators import Estimate, violations
 from torchid.estimators.conditions import term_violations
-from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_masked
 from torchid.fitting.experiment import Experiment, set_up, with_noise, with_task_weights
 from torchid.fitting.factor_files import FactorFile, read_fleet
-from torchid.fitting.fit import Fit, LogFitter
+from torchid.fitting.fit import (
+    Calibration,
+    Comparison,
+    Fit,
+    LogFitter,
+    calibrations,
+    warn_of_confounded,
+    warn_of_masked,
+)
 from torchid.fitting.left_out import CrossValidation, Scorer, calibrations_without_folds, gain_deviations
 from torchid.fitting.noise import NoiseSummary, misfit, resting_joints, unfitted_friction
 from torchid.fitting.posterior import fitted_posterior
@@ -116,7 +123,7 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         fit, mass = _judged(fit, fitter, data, checked)
         data.parts = []
         problem = fit.assembly.problem
-        compared = experiment.calibrations(fit, builder)
+        compared = calibrations(fit, experiment.robot, builder)
         shown = [*logs["test"], *logs["train"]][:1]
         forces = distributed.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
     with clock("identifiability"):

@@ -18,7 +18,7 @@ from torchid.commands.folder import REPLAY, check_free, new_folder, write_json
 from torchid.config import FootConfig
 from torchid.errors import ConfigError, LogError, TorchidWarning, about_file, during, excerpt
 from torchid.estimators.posterior import PRIOR_ERROR
-from torchid.fitting.calibration import Comparison
+from torchid.fitting.fit import Comparison
 from torchid.fitting.posterior import PosteriorSampler, read_posterior
 from torchid.logs.time_range import split_range
 from torchid.parallel import one_thread

@@ -16,10 +16,10 @@ from torchid import parameters
 from torchid.commands.chosen_settings import Choices
 from torchid.errors import UnknownNameError
 from torchid.estimators import Estimate, Violation
-from torchid.fitting.calibration import Comparison
-from torchid.fitting.left_out import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
+from torchid.fitting.fit import Comparison
+from torchid.fitting.left_out import CrossValidation, RidgeChoice
 from torchid.fitting.noise import Misfit, NoiseSummary
 from torchid.fitting.posterior import FittedPosterior
 from torchid.fitting.robust import RobustSummary

@@ -30,8 +30,8 @@ from torchid.commands.training import Training, body_eigenvalues, known_paramete
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, InputError, during, excerpt
 from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate
-from torchid.fitting.calibration import list_confounded
 from torchid.fitting.factor_files import FactorFile
+from torchid.fitting.fit import list_confounded
 from torchid.fitting.noise import Misfit
 from torchid.fitting.posterior import POSTERIOR, RESIDUAL, RigidPlusResidual, write_posterior
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes

@@ -10,8 +10,8 @@ from torchid import distributed
 from torchid.commands.plausibility import TrainingLogs, require_plausible
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.estimators.least_squares import Minimizer
-from torchid.fitting.calibration import calibration_at, list_confounded
 from torchid.fitting.experiment import RobotSetup, batch_estimator
+from torchid.fitting.fit import calibration_at, list_confounded
 from torchid.parallel import share_between_forks, thread_count
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import split_into_folds

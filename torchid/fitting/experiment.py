@@ -26,8 +26,7 @@ from torchid.errors import (
     join_names,
 )
 from torchid.estimators import Conditions, Consistent, LeastSquares
-from torchid.fitting.calibration import Calibration, Comparison, calibrations
-from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
+from torchid.fitting.fit import LogFitter, frozen_parameters
 from torchid.fitting.left_out import RIDGE, RIDGES, STRONGER, RidgeChoice, choose_ridge
 from torchid.fitting.noise import NoiseSummary, estimate_noise, mean_noise_square, recorded_sensors
 from torchid.fitting.prior_knowledge import conditions_from, known_masses
@@ -438,10 +437,6 @@ class RobotSetup:
             frozen=self.frozen(),
             masses=known_masses(settings, self.robot),
         )
-
-    def calibrations(self, fit: Fit, builder: RowBuilder) -> Comparison[Calibration]:
-        """Nominal and identified parameters of a fit, with the extra parameters that fit them best."""
-        return calibrations(fit, self.robot, builder)
 
     def estimate_noise(
         self,

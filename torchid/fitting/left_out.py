@@ -19,8 +19,16 @@ from scipy.special import stdtrit  # scipy.stats takes 0.2 s to import
 from torchid import distributed
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators.least_squares import Minimizer
-from torchid.fitting.calibration import Calibration, Comparison, calibration_at, calibrations_at
-from torchid.fitting.fit import BatchEstimator, Fit, LogFitter, LogProblem
+from torchid.fitting.fit import (
+    BatchEstimator,
+    Calibration,
+    Comparison,
+    Fit,
+    LogFitter,
+    LogProblem,
+    calibration_at,
+    calibrations_at,
+)
 from torchid.parallel import one_thread, share_between_processes, thread_count
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples

@@ -21,7 +21,7 @@ from torchid import parameters
 from torchid.errors import format_percent
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import FIXED, IDENTIFIED
-from torchid.fitting.calibration import Comparison
+from torchid.fitting.fit import Comparison
 from torchid.fitting.left_out import RidgeChoice
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.logs.time_range import log_title

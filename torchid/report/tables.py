@@ -22,7 +22,7 @@ from rich.text import Text
 from torchid.errors import escape, one_line, raw_stream
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
-from torchid.fitting.calibration import Comparison
+from torchid.fitting.fit import Comparison
 from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.information import Contribution, Contributions, PartContribution
