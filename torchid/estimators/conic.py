@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import scipy.linalg
 import torch
 from torch import Tensor
 
@@ -159,14 +158,7 @@ class ConicProblem:
         inverse = np.linalg.inv(blocks[weighted])[:, None]
         multiplier_slopes[weighted] = self.weights[weighted, None, None, None] * inverse @ self.F[weighted] @ inverse
         residual = self.gradient(x) - self.G.T @ y - self._gathered(Z)
-        # A Newton step balances the part of it in directions in which quadratic and log-determinants are stiff enough.
-        step = None if weighted.any() else self._balancing_step(residual)
-        if step is None:
-            values, vectors = self._stiffness_modes(multiplier_slopes)
-            modes = vectors.T @ (self.null_space.T @ residual)
-            balanced = np.abs(modes) <= 2.0 * _SEARCH_RADIUS * values
-            lengths = modes[balanced] / np.maximum(values[balanced], np.finfo(float).tiny)
-            step = -self.null_space @ (vectors[:, balanced] @ lengths)
+        step = self._balancing_step(residual, multiplier_slopes)
         multiplier_change = np.einsum("kv,kvij->kij", step[self.variables], multiplier_slopes)
         unbalanced = self.null_space.T @ (residual + self.hessian @ step + self._gathered(multiplier_change))
         gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + _SEARCH_RADIUS * np.abs(unbalanced).sum()
@@ -178,29 +170,24 @@ class ConicProblem:
             return np.inf
         return float(gap + (weights * (relative - 1.0 - np.log(relative))).sum())
 
-    def _balancing_step(self, residual: Array) -> Array | None:
-        """The Newton step of the quadratic; None where it is not stiff enough in all directions."""
-        if self._stiffness_root is None:
-            return None
-        lengths = scipy.linalg.cho_solve((self._stiffness_root, True), self.null_space.T @ residual)
-        return -self.null_space @ lengths if np.linalg.norm(lengths) <= 2.0 * _SEARCH_RADIUS else None
+    def _balancing_step(self, residual: Array, multiplier_slopes: Array) -> Array:
+        """The Newton step of quadratic and log-determinants, damped: short in directions without stiffness, (n,).
 
-    @cached_property
-    def _stiffness_root(self) -> Array | None:
-        """Lower triangular factor of the quadratic in the null space of the equalities; None by rounding."""
-        reduced = self.null_space.T @ self.hessian @ self.null_space if len(self.e) else self.hessian
-        try:
-            return np.asarray(np.linalg.cholesky(reduced))
-        except np.linalg.LinAlgError:
-            return None
-
-    def _stiffness_modes(self, multiplier_slopes: Array) -> tuple[Array, Array]:
-        """Those of quadratic and log-determinants, whose multipliers change by these slopes, (K, 10, 4, 4)."""
-        hessian = self.hessian.copy()
-        pairs = (self.variables[:, :, None], self.variables[:, None, :])
-        np.add.at(hessian, pairs, np.einsum("kuij,kvij->kuv", multiplier_slopes, self.F))
-        values, vectors = np.linalg.eigh(self.null_space.T @ hessian @ self.null_space)
-        return values, vectors
+        Args:
+            residual: of the gradient, (n,).
+            multiplier_slopes: changes of the log-determinants' multipliers, (K, 10, 4, 4).
+        """
+        hessian = self.hessian
+        if self.weights.any():
+            hessian = hessian.copy()
+            pairs = (self.variables[:, :, None], self.variables[:, None, :])
+            np.add.at(hessian, pairs, np.einsum("kuij,kvij->kuv", multiplier_slopes, self.F))
+        N = self.null_space
+        along = N.T @ residual
+        stiffness = N.T @ hessian @ N if len(self.e) else hessian.copy()
+        rounding = np.finfo(float).eps * np.trace(stiffness) + np.finfo(float).tiny
+        stiffness[np.diag_indices_from(stiffness)] += np.abs(along).max(initial=0.0) / _SEARCH_RADIUS + rounding
+        return np.asarray(-N @ np.linalg.solve(stiffness, along))
 
     def _gathered(self, Z: Array) -> Array:
         """Sum of <Z_k, dF_k/dx>, (n,)."""
