@@ -106,7 +106,7 @@ class Choices:
             named.append(f"Coulomb friction over {self.sign_width.value:.2g} rad/s")
         if self.delay is not None and self.delay.value:
             named.append(f"torques {1e3 * self.delay.value:.3g} ms late")
-        return "; ".join(one for one in named if one != "none")
+        return "; ".join(text for text in named if text != "none")
 
     def by_name(self) -> dict[str, object]:
         """The same by name, in words."""
@@ -144,8 +144,8 @@ def _with_chosen_data(setup: S, choices: Choices, trials: _Trials, bars: Progres
         setup = setup if choices.radius.value is None else with_radius(setup, choices.radius.value)
     actuators = setup.config.actuators
     if actuators.stiction == AUTO and actuators.stribeck is None and trials.measures_torques(setup):
-        rest = {value: _with_actuators(setup, stiction=value) for value in (False, True)}
-        choices.stiction = _chosen("samples at rest", partial(_data, rest, trials), bars)
+        by_value = {value: _with_actuators(setup, stiction=value) for value in (False, True)}
+        choices.stiction = _chosen("samples at rest", partial(_data, by_value, trials), bars)
         setup = _with_actuators(setup, stiction=bool(choices.stiction.value))
     if setup.config.preprocessing.contact_margin_s == AUTO:
         margins = {margin: _with_preprocessing(setup, contact_margin_s=margin) for margin in MARGINS}
@@ -293,8 +293,8 @@ def lower_cutoff(setup: RobotSetup) -> CutoffChoice | None:
     if files is None or files.compressed or cutoff is None:
         return None
     with suppress(InputError):
-        found = _cutoff(setup, _Trials(), CutoffChoice(cutoff, by_noise=False), _cutoff_of_motion(setup)[1])
-        return None if found.limit_hz is None else found
+        lower = _cutoff(setup, _Trials(), CutoffChoice(cutoff, by_noise=False), _cutoff_of_motion(setup)[1])
+        return None if lower.limit_hz is None else lower
     return None
 
 
@@ -324,8 +324,8 @@ class _TrialReader(LogReader):
                 log = next(recorded_segments(path, files, settings, settings.exclude_rejected)).log
             else:
                 log = super()._recorded(path)
-            rest = max(len(log) - MOST_TRIED, 0)
-            self._kept[path] = log.select(slice(rest // 2, len(log) - rest + rest // 2)) if rest else log
+            excess = max(len(log) - MOST_TRIED, 0)
+            self._kept[path] = log.select(slice(excess // 2, len(log) - excess + excess // 2)) if excess else log
         return self._kept[path]
 
 
@@ -349,13 +349,13 @@ def _cutoff(setup: RobotSetup, trials: _Trials, limit: CutoffChoice, shortest: f
     lowest_hz = max(_LOWEST_HZ, _PERIODS / shortest)
     tried = [widest_hz / 2**k for k in range(_OCTAVES) if not k or widest_hz / 2**k >= lowest_hz]
     setups = {cutoff: _with_preprocessing(setup, cutoff_hz=cutoff) for cutoff in tried}
-    found = _data(setups, trials, estimate_noise=True).value
-    return limit if found == tried[0] else replace(limit, cutoff_hz=float(f"{found:.2g}"), limit_hz=limit.cutoff_hz)
+    chosen = _data(setups, trials, estimate_noise=True).value
+    return limit if chosen == tried[0] else replace(limit, cutoff_hz=float(f"{chosen:.2g}"), limit_hz=limit.cutoff_hz)
 
 
 def _data(setups: Mapping[Any, RobotSetup], trials: _Trials, estimate_noise: bool = False) -> Profile:
     """What `choose_data` makes of setups that leave ever more samples out, or more of the band."""
-    readings = {value: partial(trials.reading, one, estimate_noise) for value, one in setups.items()}
+    readings = {value: partial(trials.reading, variant, estimate_noise) for value, variant in setups.items()}
     return choose_data(readings, trials.kinds(next(iter(setups.values()))))
 
 

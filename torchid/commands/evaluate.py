@@ -205,12 +205,14 @@ def read_run(folder: Path, device: str | None = None) -> FittedRun:
     """
     require_run(folder)
     settings = folder / _SETTINGS
-    found = folder / "parameters.json"
+    parameters_file = folder / "parameters.json"
     config = load_config(settings, [f"device={device}"] if device else [], reads_logs=False)
     with about_file(settings):
         experiment, usual, explained = _with_own_metrics(set_up(config), folder / _METRICS)
-    shared = Comparison(read_shared_extras(found, "nominal_value"), read_shared_extras(found, "value"))
-    calibrations = _calibrations(experiment, read_parameters(found, experiment.robot), shared)
+    shared = Comparison(
+        read_shared_extras(parameters_file, "nominal_value"), read_shared_extras(parameters_file, "value")
+    )
+    calibrations = _calibrations(experiment, read_parameters(parameters_file, experiment.robot), shared)
     learned = RigidPlusResidual.load(folder / RESIDUAL, experiment.robot) if (folder / RESIDUAL).is_file() else None
     return FittedRun(
         experiment=experiment, calibrations=calibrations, usual=usual, explained=explained, learned=learned
@@ -224,8 +226,8 @@ def evaluate_identification(run: Identification, logs: Sequence[str | Path], dev
     if device is not None:
         require_device(device)
         experiment = replace(experiment, config=replace(experiment.config, device=device))
-    shared = [(one.extra.label, one) for one in run.extras if not one.log]
-    values = Comparison({x: one.nominal_value for x, one in shared}, {x: one.value for x, one in shared})
+    shared = [(term.extra.label, term) for term in run.extras if not term.log]
+    values = Comparison({x: term.nominal_value for x, term in shared}, {x: term.value for x, term in shared})
     fitted = FittedRun(
         experiment=experiment,
         calibrations=_calibrations(experiment, run.phi, values),
@@ -254,9 +256,9 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
         pair = Comparison(*scorer.score([log], {log.fold: compared}, progress=lambda n: bars.advance(evaluating, n)))
         metrics[split_range(log.source).name] = pair
         if learned is not None:
-            own = replace(compared.identified, phi=learned.phi.numpy())
+            with_module = replace(compared.identified, phi=learned.phi.numpy())
             freed = learned.without_residual(log)
-            (with_residual[split_range(log.source).name],) = scorer.score([freed], {log.fold: [own]})
+            (with_residual[split_range(log.source).name],) = scorer.score([freed], {log.fold: [with_module]})
         if not any(x is not None for x in pair.identified.rms.values()):
             warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
     excluded = {split_range(path).name: count for path, count in reader.excluded.items()}
@@ -367,10 +369,10 @@ def compare_forces(evaluation: Evaluation, samples: Samples, compared: Compariso
     """
     measured = []
     predicted = []
-    for one in compared:
-        (read,) = one.calibrate([samples])
+    for calibration in compared:
+        (read,) = calibration.calibrate([samples])
         part = read[:_SAMPLES]
-        series = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
+        series = force_series(evaluation.builder, part, calibration.parameters(evaluation)[None])
         readings, forces = at_motors(evaluation.builder, part, np.stack([series[0], *series[1]]))
         measured.append(readings)
         predicted.append(forces)
@@ -388,7 +390,9 @@ def trace_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[
     step = max(1, -(-len(samples) // _TRACED))
     part = samples.every(step)
     builder = compared.identified.builder
-    projected = projected_forces(builder, part, torch.stack([one.columns(builder, samples) for one in compared]))
+    projected = projected_forces(
+        builder, part, torch.stack([calibration.columns(builder, samples) for calibration in compared])
+    )
     present = list(dict.fromkeys(map(tuple, part.active.tolist())))
     names = {state: state_name(builder.contacts, state) for state in present}
     rate = 1.0 / float(samples.time.diff().median()) if len(samples) > 1 else np.nan

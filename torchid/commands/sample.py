@@ -160,7 +160,7 @@ def _robots(samples: ParameterSamples, form: str, run: Path) -> Iterable[tuple[s
     digits = len(str(len(samples) - 1))
     suffix = {"urdf": ".urdf", "mjcf": ".xml"}[form]
     for number, phi in enumerate(samples.phi.cpu().numpy()):
-        joints = {what: {name: float(x[number]) for name, x in of.items()} for what, of in drawn.items()}
+        joints = {what: {name: float(x[number]) for name, x in values.items()} for what, values in drawn.items()}
         fitted = FittedJoints(**joints)  # type: ignore[arg-type]
         with warnings.catch_warnings():
             if number:

@@ -50,8 +50,8 @@ def accuracies(
             warn(f"{error}; no accuracy of the sensors '{name}'")
         return None
 
-    found = zip(sets, share_between_forks(list(sets), accuracy, thread_count()), strict=True)
-    return {name: one for name, one in found if one is not None}
+    results = zip(sets, share_between_forks(list(sets), accuracy, thread_count()), strict=True)
+    return {name: result for name, result in results if result is not None}
 
 
 def _reference(setup: RobotSetup, train: Sequence[Samples]) -> tuple[Assembly, RowBuilder] | None:
@@ -100,5 +100,5 @@ def _accuracy(
     channels = int(sensors.torque.sum() + possible.sum())
     confounded = list_confounded(fit.extras)
     words = tuple(map(str, confounded))
-    advice = tuple(one.in_short for one in confounded)
+    advice = tuple(confusion.in_short for confusion in confounded)
     return SetAccuracy(channels, estimate.rank, measured, words, advice)

@@ -151,8 +151,8 @@ class Training:
         train = MiniBatches(logs["train"], builder, size, seed, share=share, assembly=sampled)
         held_out = None
         if logs["validation"]:  # with the extra parameters that fit these logs best
-            own = sampled_rows(fitter, compress_parts(logs["validation"], builder))
-            held_out = MiniBatches(logs["validation"], builder, size, seed, share=share, assembly=own)
+            held_out_rows = sampled_rows(fitter, compress_parts(logs["validation"], builder))
+            held_out = MiniBatches(logs["validation"], builder, size, seed, share=share, assembly=held_out_rows)
         trainer = Trainer(self.settings, problem, train, held_out, data=sampled.problem)
         if not trainer.closed_form.rank:
             raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors or contacts")
@@ -243,8 +243,8 @@ class Training:
             with refusing_damage(self.folder):
                 self._check(state, trainer, self.folder / CHECKPOINT)
                 trainer.load_state_dict(state["trainer"])
-            found: dict[str, Any] = state["trainer"]
-            return found
+            trainer_state: dict[str, Any] = state["trainer"]
+            return trainer_state
         with new_folder(self.folder, True, TRAINING) as folder:
             (folder / "config.yaml").write_text(self._text)
         return None

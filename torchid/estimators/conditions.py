@@ -202,9 +202,9 @@ def term_violations(problem: LinearProblem, phi: Array, psi: Array | None, toler
     if terms is None:
         return []
     psi = terms.best(phi) if psi is None else psi
-    values = [(one, one.value(phi, psi)) for one in terms.conditions]
-    below = [(one, value) for one, value in values if value < -tolerance * one.size]
-    return [Violation(None, "negative", -value, one.unit, one.name) for one, value in below]
+    values = [(condition, condition.value(phi, psi)) for condition in terms.conditions]
+    below = [(condition, value) for condition, value in values if value < -tolerance * condition.size]
+    return [Violation(None, "negative", -value, condition.unit, condition.name) for condition, value in below]
 
 
 def _bound_violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float) -> list[Violation]:

@@ -69,17 +69,17 @@ class Consistent(Regularized):
         """
         problem.require_bodies()
         plain = self.least_squares.solve(problem)
-        found = self._minimum(problem)
-        phi, psi = found.minimizer
+        minimum = self._minimum(problem)
+        phi, psi = minimum.minimizer
         return ConsistentEstimate(
             **(vars(plain) | {"phi": phi, "psi": psi, "cost": problem.cost(phi, psi)}),
-            objective=found.solution.objective,
-            unconstrained=found.conic.unconstrained,
+            objective=minimum.solution.objective,
+            unconstrained=minimum.conic.unconstrained,
             distance=problem.prediction_distance(phi, plain.phi),
             eigenvalues=parameters.least_eigenvalues(phi, problem.scale),
-            gap=found.solution.gap,
-            steps=found.solution.steps,
-            active=found.conic.active(found.solution.x, AT_BOUND),
+            gap=minimum.solution.gap,
+            steps=minimum.solution.steps,
+            active=minimum.conic.active(minimum.solution.x, AT_BOUND),
         )
 
     @report_rounding("consistent")

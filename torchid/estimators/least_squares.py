@@ -317,8 +317,8 @@ class _Inverse:
         unit = torch.eye(len(A), dtype=A.dtype)
         if not A.numel():  # LAPACK takes no empty matrix
             return cls(A, A.mT, A.mT @ A, A.new_zeros(0), 0)
-        found = torch.linalg.lstsq(A, unit, rcond=relative_tolerance(tolerance, A.shape), driver="gelsd")
-        return cls(A, found.solution, found.solution @ A, found.singular_values, int(found.rank))
+        solved = torch.linalg.lstsq(A, unit, rcond=relative_tolerance(tolerance, A.shape), driver="gelsd")
+        return cls(A, solved.solution, solved.solution @ A, solved.singular_values, int(solved.rank))
 
     def solve(self, weights: Array, B: Tensor) -> Tensor:
         """Minimizers X of ||A X - B||^2 + weight ||X||^2 for each of K weights, (K, P, M), of least norm for 0.

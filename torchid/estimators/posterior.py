@@ -87,8 +87,8 @@ class Posterior:
 
     def owners(self) -> np.ndarray:
         """The body that each variable of the conic problem belongs to, (n,) int; extra parameters are on their own."""
-        own = len(self.nominal) // PER_BODY + np.arange(len(self.extra_size))
-        return np.concatenate([np.flatnonzero(self.free) // PER_BODY, own])
+        of_extras = len(self.nominal) // PER_BODY + np.arange(len(self.extra_size))
+        return np.concatenate([np.flatnonzero(self.free) // PER_BODY, of_extras])
 
     @property
     def _thinnest(self) -> float:
@@ -279,6 +279,6 @@ def _likelihood_of_widths(rows: Array, widths: Array) -> Array | None:
     kept = is_significant(values, RANK_TOLERANCE)
     if not kept.any():
         return None
-    found = np.square(U[:, kept].T @ rows[:, -1])
+    explained = np.square(U[:, kept].T @ rows[:, -1])
     of_data = 1.0 + np.outer(np.square(widths), np.square(values[kept]))
-    return np.asarray(-(np.log(of_data) + found / of_data).sum(axis=1))
+    return np.asarray(-(np.log(of_data) + explained / of_data).sum(axis=1))

@@ -56,13 +56,13 @@ class LossTerms:
 def add_up(terms: LossTerms, trained: Sequence[nn.Parameter]) -> LossTerms:
     """Add up what the processes that share a batch have: the gradients of what is trained, and the terms, returned."""
     trained = [x for x in trained if x.grad is not None]
-    own = [x.grad.cpu().numpy() for x in trained if x.grad is not None]
+    own_gradients = [x.grad.cpu().numpy() for x in trained if x.grad is not None]
     values = [{name: float(x) for name, x in sums.items()} for sums in (terms.losses, terms.squares)]
-    gradients, sums = zip(*distributed.all_gather((own, values), "gradients"), strict=True)
+    gradients, sums = zip(*distributed.all_gather((own_gradients, values), "gradients"), strict=True)
     for x, parts in zip(trained, zip(*gradients, strict=True), strict=True):
         x.grad = torch.from_numpy(np.sum(parts, axis=0)).to(x)
     losses, squares = (
-        {name: torch.tensor(sum(one[name] for one in same), dtype=torch.float64) for name in same[0]}
+        {name: torch.tensor(sum(part[name] for part in same), dtype=torch.float64) for name in same[0]}
         for same in zip(*sums, strict=True)
     )
     return LossTerms(losses, squares)
@@ -183,8 +183,8 @@ def _difference(problem: LinearProblem, data: LinearProblem, device: torch.devic
         return torch.from_numpy(A).to(device), torch.from_numpy(b).to(device)
 
     (A, b), (C, d) = quadratic(problem), quadratic(data)
-    rest = problem.residual - data.residual
-    return lambda x: ((A @ x - b).square().sum() - (C @ x - d).square().sum() + rest) / max(problem.rows, 1)
+    residual = problem.residual - data.residual
+    return lambda x: ((A @ x - b).square().sum() - (C @ x - d).square().sum() + residual) / max(problem.rows, 1)
 
 
 @dataclass(frozen=True)
@@ -395,10 +395,10 @@ class Trainer:
             elapsed = time.perf_counter() - start
             held_out = None if self.held_out is None else self.loss.mean_square(self.held_out)
         losses["total"] = sum(losses.values())
-        found = self._minimizer()
+        minimizer = self._minimizer()
         size = squares.pop("measured")
         with np.errstate(over="ignore", invalid="ignore"):
-            self._require_converging(self._objective(found))  # after the last step: losses are those before it
+            self._require_converging(self._objective(minimizer))  # after the last step: losses are those before it
         self._require_converging(0.0 if held_out is None else held_out)
         if not all(bool(x.isfinite().all()) for x in chain(*self._trained)):
             self._require_converging(float("nan"))  # of a module, in the last step
@@ -411,9 +411,9 @@ class Trainer:
             number=self.epoch,
             losses=losses,
             held_out=held_out,
-            objective=self._objective(found),
+            objective=self._objective(minimizer),
             closed_form=self._least or 0.0,
-            distance=self.problem.prediction_distance(found.phi, self.closed_form.phi),
+            distance=self.problem.prediction_distance(minimizer.phi, self.closed_form.phi),
             shares={name: float(np.sqrt(x / size)) if size else 0.0 for name, x in squares.items()},
             learning_rate=rate,
             samples_per_second=self.batches.samples / elapsed,
@@ -439,25 +439,25 @@ class Trainer:
         """
         self.loss.load_state_dict(self._best)
         plain = self.closed_form
-        found = self._minimizer()
+        minimizer = self._minimizer()
         finish = self.finished and self.held_out is None and self.loss.residual is None and self.settings.finish
         if self.settings.consistency == "penalties":
-            found = least_penalized(self.settings, self.problem, found) if finish else found
+            minimizer = least_penalized(self.settings, self.problem, minimizer) if finish else minimizer
         elif finish:
-            found = self.settings.consistent.minimize(self.problem)
+            minimizer = self.settings.consistent.minimize(self.problem)
         else:
-            found = nearest_allowed(self.settings, self.problem, found)
-        phi, psi = found
+            minimizer = nearest_allowed(self.settings, self.problem, minimizer)
+        phi, psi = minimizer
         return SgdEstimate(
             **(vars(plain) | {"phi": phi, "psi": psi, "cost": self.problem.cost(phi, psi)}),
-            objective=self._objective(found),
+            objective=self._objective(minimizer),
             unconstrained=self._least,
             distance=self.problem.prediction_distance(phi, plain.phi),
             eigenvalues=parameters.least_eigenvalues(phi, self.problem.scale),
             epochs=self.epoch,
             best_epoch=self.best_epoch,
             residual=residual_effect(self.loss, self.batches),
-            excess=None if self.loss.residual is not None else excess(self.settings, self.problem, found),
+            excess=None if self.loss.residual is not None else excess(self.settings, self.problem, minimizer),
         )
 
     def state_dict(self) -> dict[str, Any]:
@@ -498,10 +498,10 @@ class Trainer:
         self.optimizer.load_state_dict(state)
         trained = [x for group in self.optimizer.param_groups for x in group["params"]]
         for index, saved in state["state"].items():
-            own = self.optimizer.state[trained[index]]
+            current = self.optimizer.state[trained[index]]
             for name, value in saved.items():
                 if isinstance(value, Tensor):
-                    own[name] = own[name].to(value.dtype)
+                    current[name] = current[name].to(value.dtype)
 
     def _snapshot(self) -> dict[str, Tensor]:
         return {name: x.detach().clone() for name, x in self.loss.state_dict().items()}

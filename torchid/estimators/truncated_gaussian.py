@@ -66,12 +66,12 @@ class BarrierGaussian:
 
     def marginal(self, variables: np.ndarray, blocks: np.ndarray, rows: np.ndarray) -> BarrierGaussian:
         """The Gaussian of some variables, (m,) int, whatever the others are, some blocks, (K,), and rows, (M,) bool."""
-        rest = np.setdiff1d(np.arange(len(self.mean)), variables)
-        triangle = np.asarray(np.linalg.qr(self.root[:, [*rest, *variables]], mode="r"))
+        others = np.setdiff1d(np.arange(len(self.mean)), variables)
+        triangle = np.asarray(np.linalg.qr(self.root[:, [*others, *variables]], mode="r"))
         directions = np.asarray(np.linalg.qr(self.directions[variables].T, mode="r")).T
         return BarrierGaussian(
             mean=self.mean[variables],
-            root=triangle[len(rest) :, len(rest) :],
+            root=triangle[len(others) :, len(others) :],
             directions=directions,
             blocks=self.blocks[blocks][:, :, variables],
             rows=self.rows[rows][:, variables],
@@ -347,7 +347,7 @@ class EllipticalSlice(torch.nn.Module):
         least = angle - 2.0 * math.pi
         most = angle
         out = torch.zeros_like(angle)
-        left = torch.arange(len(angle), device=angle.device)
+        chains = torch.arange(len(angle), device=angle.device)
         for count in _TRIES:
             tried = angle.new_empty(count, len(angle))
             for number in range(count):  # as if all before had failed, so that these need not be known to have
@@ -361,13 +361,13 @@ class EllipticalSlice(torch.nn.Module):
             fits = inside(there[:cut].view(-1, 10, there.shape[1]) + self.unit, there[cut:])
             fits &= self._excess(there, cut, near) >= level.repeat(count)
             failed = (~fits).view(count, -1).to(torch.int64).cumprod(0).sum(0)  # before the first that fits
-            found = torch.nonzero(failed < count)[:, 0]
-            out[left[found]] = tried[failed[found], found]
-            rest = torch.nonzero(failed == count)[:, 0]
-            if not len(rest):
+            fitting = torch.nonzero(failed < count)[:, 0]
+            out[chains[fitting]] = tried[failed[fitting], fitting]
+            failing = torch.nonzero(failed == count)[:, 0]
+            if not len(failing):
                 break
-            left, level, angle, least, most = (x[rest] for x in (left, level, angle, least, most))
-            now, along, across = (x.index_select(1, rest) for x in (now, along, across))
+            chains, level, angle, least, most = (x[failing] for x in (chains, level, angle, least, most))
+            now, along, across = (x.index_select(1, failing) for x in (now, along, across))
         return out
 
     def _excess(self, entries: Tensor, cut: int, near: tuple[Tensor, Tensor]) -> Tensor:
@@ -501,19 +501,19 @@ class TruncatedGaussian(torch.nn.Module):
         counts = [count * (k + 1) // batches - count * k // batches for k in range(batches)]
         tasks = list(enumerate(zip(counts, seeds, strict=True)))
         threads = worker_count(device)
-        done = run_in_workers(tasks, lambda part: [(number, self._batch(*of)) for number, of in part], threads)
+        done = run_in_workers(tasks, lambda part: [(number, self._batch(*batch)) for number, batch in part], threads)
         drawn = dict(pair for pairs in done for pair in pairs)
         return torch.cat([drawn[k] for k in range(batches)], dim=1).T.contiguous()
 
     def _batch(self, count: int, seed: int) -> Tensor:
         """Points (n, count)."""
         generator = torch.Generator(self.mean.device).manual_seed(seed)
-        found = 0
+        drawn = 0
         out = []
         for near in self._states(min(count, _BATCH_CHAINS), generator):
             out.append(self._completed(near, generator))
-            found += out[-1].shape[1]
-            if found >= count:
+            drawn += out[-1].shape[1]
+            if drawn >= count:
                 break
         return torch.cat(out, dim=1)[:, :count]
 

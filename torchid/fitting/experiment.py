@@ -225,10 +225,10 @@ def resolve_contacts(settings: Sequence[ContactConfig], robot: Robot) -> tuple[t
         if given.radius == "auto" and contact.kind != "flat":
             shapes = shapes or CollisionShapes(robot)
             shape = shapes.about(contact.frame, contact.rolling_axis)
-        found = RollingShape("point", 0.0, contact.frame) if shape is None else shape
+        rolling = RollingShape("point", 0.0, contact.frame) if shape is None else shape
         x, y, z = UP if given.normal is None else given.normal
-        a, b, c = found.centre if given.centre == "auto" else given.centre
-        radius = found.radius if given.radius == "auto" else given.radius
+        a, b, c = rolling.centre if given.centre == "auto" else given.centre
+        radius = rolling.radius if given.radius == "auto" else given.radius
         try:
             contact = replace(contact, normal=(x, y, z), radius=radius, centre=(a, b, c))
         except SensorError as error:
@@ -480,10 +480,10 @@ class RobotSetup:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
                 problem = fitter.build_problem(merge(parts, fitter.builder, *BY_FOLD)).assembly.problem
-                left = plain.solve(problem).residual_std
-            ridges = tuple(float(f"{max(RIDGE * left**2, RIDGES[0]) * factor:.2g}") for factor in STRONGER)
+                residual_std = plain.solve(problem).residual_std
+            ridges = tuple(float(f"{max(RIDGE * residual_std**2, RIDGES[0]) * factor:.2g}") for factor in STRONGER)
             if len({part.fold for part in parts}) < 2:
-                return RidgeChoice(ridges[0], ridges[:1], (left**2,), (0.0,))
+                return RidgeChoice(ridges[0], ridges[:1], (residual_std**2,), (0.0,))
         estimators = [batch_estimator(replace(settings, ridge=ridge), conditions) for ridge in ridges]
         try:
             return choose_ridge(parts, blocks, fitter, estimators, rule=settings.ridge_rule)

@@ -133,16 +133,18 @@ def require_same_rows(path: object, found: RowModel, expected: RowModel, referen
         LogError: names the setting, its value and the accepted one.
     """
     for key in (*expected.settings, *(key for key in found.settings if key not in expected.settings)):
-        one = found.settings.get(key)
+        value = found.settings.get(key)
         other = expected.settings.get(key)
-        if one != other:
-            raise LogError(path, key, *_texts(one, other, reference))
+        if value != other:
+            raise LogError(path, key, *_texts(value, other, reference))
     if found.noise.keys() != expected.noise.keys():
         raise LogError(path, NOISE, join_names(list(found.noise)) or "none", join_names(list(expected.noise)))
     for name, array in expected.geometry.items():
-        own = found.geometry[name]
-        if own.shape != array.shape or not np.allclose(own, array, rtol=0.0, atol=KINEMATIC_TOLERANCE):
-            raise LogError(path, "robot.urdf", _where(name, own, array, expected), f"the kinematics of {reference}")
+        array_found = found.geometry[name]
+        if array_found.shape != array.shape or not np.allclose(array_found, array, rtol=0.0, atol=KINEMATIC_TOLERANCE):
+            raise LogError(
+                path, "robot.urdf", _where(name, array_found, array, expected), f"the kinematics of {reference}"
+            )
 
 
 def require_same_noise(path: object, found: RowModel, expected: RowModel, reference: object) -> None:
@@ -521,7 +523,10 @@ def _log(source: str, description: _Description, values: Array) -> CompressedLog
     parts = _PartReader(source, description, values)
     pieces = [parts.read(one) for one in description.pieces]
     by_state = [parts.read(one) for one in description.by_state]
-    unloaded = {(start, stop): [parts.read(x, unloaded=True) for x in own] for start, stop, own in description.unloaded}
+    unloaded = {
+        (start, stop): [parts.read(x, unloaded=True) for x in parts_in_air]
+        for start, stop, parts_in_air in description.unloaded
+    }
     parts.require_all_read()
     if not set(unloaded) <= {span for count in range(1, blocks + 1) for span in block_spans(samples, count)}:
         raise ValueError("readings in the air of what is no block of the log")
@@ -590,14 +595,14 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
     paths = experiment.config.logs.train
     files: list[FactorFile] = []
     for path in paths:
-        one = read_factors(path)
+        file = read_factors(path)
         if not files:
             with about_file(path), reader_errors_explained("settings", _ACCEPTED):
-                experiment = with_choices_of(one.model, experiment)
+                experiment = with_choices_of(file.model, experiment)
             model = row_model(experiment, experiment.builder(experiment.sensors))
-        require_same_rows(path, one.model, model, _THE_EXPERIMENT)
-        files.append(one)
-        require_same_noise(path, one.model, files[0].model, paths[0])
+        require_same_rows(path, file.model, model, _THE_EXPERIMENT)
+        files.append(file)
+        require_same_noise(path, file.model, files[0].model, paths[0])
         if on_read is not None:
             on_read(path)
     _require_different_logs(paths, files)
@@ -608,7 +613,7 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
     noise = groups.noise(groups.values(experiment.noise) | used, experiment.noise)
     listed = [GroupNoise(name, groups.unit(name), origins.get(name, "stated"), x, None) for name, x in used.items()]
     summary = NoiseSummary(noise, listed, {}, 0)
-    return Fleet(with_noise(experiment, summary), files, summary, merge_state_reports(one.states for one in files))
+    return Fleet(with_noise(experiment, summary), files, summary, merge_state_reports(file.states for file in files))
 
 
 def with_choices_of(model: RowModel, experiment: Experiment) -> Experiment:
@@ -656,11 +661,11 @@ def _numbers(text: Value) -> list[float]:
 
 def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) -> None:
     seen: dict[str, Path] = {}
-    for path, one in zip(paths, files, strict=True):
-        if one.sha256 and one.sha256 in seen:
-            found = f"of the same log as {seen[one.sha256]} ({excerpt(one.name)})"
+    for path, file in zip(paths, files, strict=True):
+        if file.sha256 and file.sha256 in seen:
+            found = f"of the same log as {seen[file.sha256]} ({excerpt(file.name)})"
             raise LogError(path, "sha256", found, "factors of every log once")
-        seen[one.sha256] = path
+        seen[file.sha256] = path
 
 
 def _require_stated_noise(experiment: Experiment, model: RowModel, path: Path) -> None:

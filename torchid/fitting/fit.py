@@ -194,10 +194,10 @@ class LogFitter:
             return problem
         noise: Mapping[int, float] = {}
         for _ in range(_TURNS):
-            found = self._reading_noise(problem)
-            if all(abs(found[at] - noise.get(at, 0.0)) <= _SETTLED * found[at] for at in found):
+            noise_found = self._reading_noise(problem)
+            if all(abs(noise_found[at] - noise.get(at, 0.0)) <= _SETTLED * noise_found[at] for at in noise_found):
                 break
-            noise = {at: float(np.sqrt(x * noise.get(at, x))) for at, x in found.items()}  # x alone overshoots
+            noise = {at: float(np.sqrt(x * noise.get(at, x))) for at, x in noise_found.items()}  # x alone overshoots
             problem = LogProblem(problem.parts, self.assemble(problem.parts, noise))
         return problem
 
@@ -231,8 +231,8 @@ class LogFitter:
 def _is_homogeneous(problem: LinearProblem, forces: float) -> bool:
     """Whether nothing is left of the measured forces, of this squared norm, once unknown scales are eliminated."""
     fixed = ~problem.free
-    left = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
-    return float(left @ left) + problem.residual <= RANK_TOLERANCE**2 * forces
+    forces_left = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
+    return float(forces_left @ forces_left) + problem.residual <= RANK_TOLERANCE**2 * forces
 
 
 def with_block_errors(fit: Fit, jackknife: Jackknife, factor: float = 1.0) -> Fit:
@@ -363,11 +363,11 @@ class Calibration:
     def _values_for(self, log: Block) -> Array:
         extras = self.builder.extras
         values = self._known(extras, log.source)
-        own = np.array([x.per_log for x in extras])
-        if own.any() and not any(source == log.source for source, _ in self.values):
+        per_log = np.array([x.per_log for x in extras])
+        if per_log.any() and not any(source == log.source for source, _ in self.values):
             if log.source not in self._of_new_logs:
-                self._of_new_logs[log.source] = self._fitted(log, values[~own])
-            values[own] = self._of_new_logs[log.source]
+                self._of_new_logs[log.source] = self._fitted(log, values[~per_log])
+            values[per_log] = self._of_new_logs[log.source]
         return values
 
     def _fitted(self, log: Block, shared: Array) -> Array | float:
@@ -405,7 +405,7 @@ def calibrations_at(
 ) -> Comparison[Calibration]:
     """As `calibrations`, of what an estimator has found; arguments as of `calibration_at`."""
     pair = Minimizer(assembly.problem.nominal), minimizer
-    return Comparison(*(calibration_at(assembly, one, robot, builder) for one in pair))
+    return Comparison(*(calibration_at(assembly, point, robot, builder) for point in pair))
 
 
 def calibration_at(assembly: Assembly, minimizer: Minimizer, robot: Robot, builder: RowBuilder) -> Calibration:
@@ -419,9 +419,9 @@ def calibration_at(assembly: Assembly, minimizer: Minimizer, robot: Robot, build
     """
     extras = zip(assembly.eliminations, assembly.extras_at(*minimizer), strict=True)
     values = {
-        (one.log, extra.label): float(value)
-        for one, found in extras
-        for extra, value, std in zip(one.extras, found, one.std_if_known, strict=True)
+        (elimination.log, extra.label): float(value)
+        for elimination, numbers in extras
+        for extra, value, std in zip(elimination.extras, numbers, elimination.std_if_known, strict=True)
         if np.isfinite(std)
     }
     return Calibration(robot=robot, builder=builder, phi=minimizer.phi, values=values)
@@ -436,9 +436,9 @@ def warn_of_confounded(extras: Sequence[ExtraEstimate]) -> None:
     Warns:
         ConfoundedWarning: one for each log that has some.
     """
-    for one in list_confounded(extras):
-        with about_file(one.log or current_file()):
-            warn_about_file(str(one), ConfoundedWarning)
+    for confusion in list_confounded(extras):
+        with about_file(confusion.log or current_file()):
+            warn_about_file(str(confusion), ConfoundedWarning)
 
 
 @dataclass(frozen=True)
@@ -475,12 +475,12 @@ def list_confounded(extras: Sequence[ExtraEstimate]) -> list[Confounded]:
     out = []
     for log in dict.fromkeys(x.log for x in extras):
         for by_mass in (True, False):
-            own = [x for x in extras if x.log == log and not x.separable and x.mass_separates is by_mass]
-            if not own:
+            group = [x for x in extras if x.log == log and not x.separable and x.mass_separates is by_mass]
+            if not group:
                 continue
-            others = dict.fromkeys(name for x in own for name in x.confounded_with if " of " not in name)
-            found = (_TOTAL_MASS,) if by_mass else tuple(others)
-            out.append(Confounded(log, tuple(x.extra.label for x in own), found, _advice(own, by_mass)))
+            others = dict.fromkeys(name for x in group for name in x.confounded_with if " of " not in name)
+            with_what = (_TOTAL_MASS,) if by_mass else tuple(others)
+            out.append(Confounded(log, tuple(x.extra.label for x in group), with_what, _advice(group, by_mass)))
     return out
 
 

@@ -107,8 +107,8 @@ class Reading:
         prior = np.repeat([weight, _WEAK * weight], [self.spread.shape[1], len(fitted)])
         gains = np.array([bool(self.gain) and self.extras[number].what == "scale" for number in fitted], dtype=bool)
         if gains.any():  # one that all share is another robot's mass
-            own = np.eye(gains.sum()) - 1.0 / gains.sum()
-            unit[np.ix_(count + np.array([*fitted])[gains], gains)] = self.gain / _BODIES * own
+            about_mean = np.eye(gains.sum()) - 1.0 / gains.sum()
+            unit[np.ix_(count + np.array([*fitted])[gains], gains)] = self.gain / _BODIES * about_mean
             prior[self.spread.shape[1] :][gains] = weight
         columns = np.hstack([self.spread, unit])
         normal = columns.T @ gram[:-1, :-1] @ columns
@@ -156,8 +156,8 @@ class Reading:
         """The same rows in the columns of a reading that has all extra parameters of this one, and more."""
         count = len(other.nominal) - len(other.extras)
         labels = [extra.label for extra in other.extras]
-        own = (count + labels.index(extra.label) for extra in self.extras)
-        at = np.array([*range(count), *own, len(other.nominal)])
+        columns = (count + labels.index(extra.label) for extra in self.extras)
+        at = np.array([*range(count), *columns, len(other.nominal)])
         grams = np.zeros((len(self.rows), *other.grams.shape[1:]))
         grams[:, at[:, None], at] = self.grams
         return replace(other, grams=grams, rows=self.rows)
@@ -184,8 +184,8 @@ def gain_deviations(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerm
     if not (gain and len(logs) and fitter.builder.sensors.torque[: robot.n].any()) or "joint_torque" in terms.scales:
         return np.zeros((0, count))
     wide = with_terms(fitter, replace(terms, scales={**terms.scales, "joint_torque": "all"}))
-    some = thinned(logs)
-    reading = compress_reading(some, {log.source: log.time.numpy()[[0, -1]] for log in some}, wide)
+    thin = thinned(logs)
+    reading = compress_reading(thin, {log.source: log.time.numpy()[[0, -1]] for log in thin}, wide)
     free = np.ones(count, dtype=bool) if fitter.frozen is None else ~fitter.frozen
     out = np.zeros((len(wide.builder.extras) - len(fitter.builder.extras), count))
     out[:, free] = gain * reading.by_scales(fitter.estimator.ridge) * parameter_scale(robot.nominal).flatten()[free]
@@ -221,8 +221,8 @@ def compress_reading(
         rows[block] += part.factor.rows
         for support, x in part.factor.blocks.items():
             at = [*support, builder.width]
-            own = x.cpu().double().numpy()
-            grams[block][np.ix_(at, at)] += own.T @ own
+            triangle = x.cpu().double().numpy()
+            grams[block][np.ix_(at, at)] += triangle.T @ triangle
     prior = column_prior(builder, robot, fitter.friction)
     free = np.ones(prior.spread.shape[1], dtype=bool) if fitter.frozen is None else ~fitter.frozen
     nominal = np.zeros(builder.width)
@@ -234,10 +234,10 @@ def compress_reading(
     spread[: builder.columns.count] = prior.spread[:, free] / PRIOR_DEVIATION
     oversampling = sum(map(len, logs)) / sum(len(log) / log.oversampling for log in logs)
     of_logs = [k for k, extra in enumerate(builder.extras, builder.columns.count) if extra.per_log]
-    rest = [k for k in range(builder.width) if k not in of_logs]
-    grams = np.array([_eliminated(gram, of_logs, [*rest, builder.width]) for gram in grams])
+    shared_columns = [k for k in range(builder.width) if k not in of_logs]
+    grams = np.array([_eliminated(gram, of_logs, [*shared_columns, builder.width]) for gram in grams])
     shared = tuple(extra for extra in builder.extras if not extra.per_log)
-    return Reading(grams, rows, oversampling, nominal[rest], spread[rest], shared, gain)
+    return Reading(grams, rows, oversampling, nominal[shared_columns], spread[shared_columns], shared, gain)
 
 
 def _eliminated(gram: Array, own: Sequence[int], rest: Sequence[int]) -> Array:
@@ -251,11 +251,11 @@ def thinned(logs: Sequence[Samples], count: int = SAMPLES) -> list[Samples]:
     step = max(1, sum(map(len, logs)) // count)
     out = []
     for log in logs:
-        some: dict[str, object] = {"folder": None, "motion_noise": None, "unloaded": None}
+        without: dict[str, object] = {"folder": None, "motion_noise": None, "unloaded": None}
         if log.torque is not None and len(log) > 1:
             rate = np.gradient(log.torque.numpy(), log.time.numpy(), axis=0)[:, : log.joint_velocity.shape[1]]
-            some["slope"] = torch.from_numpy(rate)
-        thin = replace(log, **some).every(step)  # type: ignore[arg-type]
+            without["slope"] = torch.from_numpy(rate)
+        thin = replace(log, **without).every(step)  # type: ignore[arg-type]
         out.append(replace(thin, oversampling=max(1.0, log.oversampling / step)))
     return out
 
@@ -280,8 +280,10 @@ def _ends(log: Samples, edges: Array) -> tuple[list[int], list[int]]:
 
 def with_terms(fitter: LogFitter, terms: ExtraTerms) -> LogFitter:
     """A fitter of rows with other extra parameters."""
-    of = fitter.builder
-    return replace(fitter, builder=RowBuilder(fitter.robot, of.contacts, of.sensors, terms).to(of.device))
+    builder = fitter.builder
+    return replace(
+        fitter, builder=RowBuilder(fitter.robot, builder.contacts, builder.sensors, terms).to(builder.device)
+    )
 
 
 @dataclass(frozen=True)
@@ -339,15 +341,15 @@ def leave_sensors_out(
 
     Source: sensors that make predictions worse, Mistry, Schaal, Yamane 2009, IV-E; the score is that of `choose_terms`.
     """
-    some = thinned(logs)
-    of = fitter.builder
+    thin = thinned(logs)
+    all_rows = fitter.builder
     out = dict[str, Evidence]()
-    edges = block_edges(some)
-    whole = compress_reading(some, edges, fitter)
+    edges = block_edges(thin)
+    whole = compress_reading(thin, edges, fitter)
     kinds = {kind_of(extra) for extra in whole.extras}
     for name, sensors in sets.items():
-        builder = RowBuilder(fitter.robot, of.contacts, sensors, terms).to(of.device)
-        fewer = compress_reading(some, edges, replace(fitter, builder=builder)).in_columns_of(whole)
+        builder = RowBuilder(fitter.robot, all_rows.contacts, sensors, terms).to(all_rows.device)
+        fewer = compress_reading(thin, edges, replace(fitter, builder=builder)).in_columns_of(whole)
         out[name] = Evidence.of(whole.left_out(kinds, fewer), fewer.left_out(kinds))
     return out
 
@@ -419,13 +421,15 @@ def widest(readings: Sequence[Reading], terms: Collection[str]) -> int:
         terms: kinds of the extra parameters that are fitted.
     """
     # a filter that takes off twice the noise also makes twice as many samples say the same: the prior weighs alike
-    ridges = [RIDGE * one.oversampling / readings[0].oversampling for one in readings]
-    own = [one.left_out(terms, None, ridge) for one, ridge in zip(readings, ridges, strict=True)]
-    for number, one in enumerate(readings[:-1]):
+    ridges = [RIDGE * reading.oversampling / readings[0].oversampling for reading in readings]
+    squares = [reading.left_out(terms, None, ridge) for reading, ridge in zip(readings, ridges, strict=True)]
+    for number, reading in enumerate(readings[:-1]):
         for other in range(number + 1, len(readings)):
-            here = one.left_out(terms, readings[other], ridges[number])
+            here = reading.left_out(terms, readings[other], ridges[number])
             there = readings[other]
-            of_both = Evidence.of(own[number] * here, own[other] * there.left_out(terms, one, ridges[other]))
+            of_both = Evidence.of(
+                squares[number] * here, squares[other] * there.left_out(terms, reading, ridges[other])
+            )
             if of_both.certain and of_both.gain > _WORSE:
                 break
         else:
@@ -471,8 +475,8 @@ def sum_residuals(
         log = by_source[part.source]
         measured = float(R[:, -1] @ R[:, -1])
         rows = part.factor.rows
-        for number, one in enumerate(calibrations):
-            residual = R[:, :-1] @ one.columns(builder, log).cpu() - R[:, -1]
+        for number, calibration in enumerate(calibrations):
+            residual = R[:, :-1] @ calibration.columns(builder, log).cpu() - R[:, -1]
             sums[number] += float(residual @ residual), measured, rows * log.noise_left, rows
     return [ResidualSquares(*squares, rows=int(rows)) for *squares, rows in sums.tolist()]
 
@@ -564,14 +568,14 @@ def calibrations_without_folds(fit: Fit | LogProblem, fitter: LogFitter) -> list
     blocks = merge(fit.parts, fitter.builder, *BY_FOLD)
 
     def without(fold: int) -> tuple[Assembly, Minimizer]:
-        rest = [block for block in blocks if block.fold != fold]
+        others = [block for block in blocks if block.fold != fold]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
-            assembly = fitter.assemble(rest, fit.assembly.reading_noise)
+            assembly = fitter.assemble(others, fit.assembly.reading_noise)
             return assembly, fitter.estimator.minimize(assembly.problem)
 
     solved = share_between_processes(folds, without, thread_count())
-    return [calibrations_at(assembly, found, fitter.robot, fitter.builder) for assembly, found in solved]
+    return [calibrations_at(assembly, minimizer, fitter.robot, fitter.builder) for assembly, minimizer in solved]
 
 
 @one_thread()
@@ -617,8 +621,10 @@ def choose_ridge(
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
-        for (fold, first), found in zip(shares, share_between_processes(shares, held_out, thread_count()), strict=True):
-            squares[folds.index(fold), first::count] = found
+        for (fold, first), squares_of_fold in zip(
+            shares, share_between_processes(shares, held_out, thread_count()), strict=True
+        ):
+            squares[folds.index(fold), first::count] = squares_of_fold
     means = squares.mean(axis=0)
     best = int(means.argmin())
     ridges = tuple(float(estimator.ridge) for estimator in estimators)
@@ -639,14 +645,16 @@ def _held_out_squares(
     """Mean squares on a fold of what each estimator fits without it."""
     assembly = fitter.build_problem([part for part in parts if part.fold != fold]).assembly
     logs = [x for x in blocks if x.fold == fold]
-    own = [x for x in parts if x.fold == fold]
+    held_out = [x for x in parts if x.fold == fold]
     fitted = []
     for estimator in estimators:
-        found = estimator.minimize(assembly.problem)
-        fitted.append(calibration_at(assembly, found, fitter.robot, fitter.builder))
+        minimizer = estimator.minimize(assembly.problem)
+        fitted.append(calibration_at(assembly, minimizer, fitter.robot, fitter.builder))
         if done is not None:
             done(1)
-    return np.array([left.error / max(left.rows, 1) for left in sum_residuals(fitter.builder, logs, own, fitted)])
+    return np.array(
+        [squares.error / max(squares.rows, 1) for squares in sum_residuals(fitter.builder, logs, held_out, fitted)]
+    )
 
 
 def _too_few(logs: Sequence[Block]) -> LogError:
@@ -744,15 +752,15 @@ class Scorer:
 
         Empty without samples.
         """
-        rows, (some, *_) = self.evaluation.robot.n_rows, compared.values()
+        rows, (first, *_) = self.evaluation.robot.n_rows, compared.values()
         if not logs:
-            return [(ForceSums(rows), ForceSums(rows)) for _ in some]
+            return [(ForceSums(rows), ForceSums(rows)) for _ in first]
         phi = {fold: np.stack([x.parameters(self.evaluation) for x in own]) for fold, own in compared.items()}
-        if not some[0].changes_readings:
+        if not first[0].changes_readings:
             measured, *errors = self.evaluation.force_sums([log.every(step) for log in logs], phi, progress)
             return [(ForceSums.total([measured]), error) for error in errors]
         pairs = []
-        for number in range(len(some)):
+        for number in range(len(first)):
             identified = number == 1  # of all fits, which would say the same
             with warnings.catch_warnings():
                 if not identified:

@@ -80,12 +80,12 @@ class NoiseSummary:
     @property
     def any_stated(self) -> bool:
         """Whether a user has stated any of it."""
-        return any(one.origin == "stated" for one in self.groups)
+        return any(group.origin == "stated" for group in self.groups)
 
     @property
     def known(self) -> dict[str, Any]:
         """Fields of `noise` that the sensors have a group of, with their values."""
-        keys = dict.fromkeys(noise_key(one.group) for one in self.groups)
+        keys = dict.fromkeys(noise_key(group.group) for group in self.groups)
         return {key: getattr(self.noise, key) for key in keys}
 
 
@@ -226,9 +226,9 @@ def _suggested(rows: SampledRows, tied: Sequence[str], free: GroupVariances) -> 
 
     Values are by the names of joints, or for the three axes, as `sensors.noise` has them.
     """
-    found = _rounded(rows.reference_std * np.sqrt(free.variance))
+    shown_std = _rounded(rows.reference_std * np.sqrt(free.variance))
     clear = free.estimated & ~free.upper_bound & ~free.confounded
-    known = {name: float(x) for name, x, yes in zip(rows.groups, found, clear, strict=True) if yes}
+    known = {name: float(x) for name, x, yes in zip(rows.groups, shown_std, clear, strict=True) if yes}
     stated = dict(zip(rows.groups, rows.reference_std, strict=True))
     ratios = [known[name] / stated[name] for name in tied if name in known]
     if not ratios or (max(ratios) <= _APART and max(ratios) <= _APART**2 * min(ratios)):
@@ -342,11 +342,13 @@ def misfit(
         jackknife: of the estimate over blocks of them.
         friction: that was not fitted.
     """
-    left = np.average([log.noise_left for log in logs], weights=[len(log) for log in logs])
-    stated = any(one.origin == "stated" for one in noise.groups)
-    expected = float(np.sqrt(left)) if stated else None
-    excess = {one.group: (one.residual or 0.0) / ((expected or 1.0) * one.used) for one in noise.groups}
-    beyond = [one for one in noise.groups if excess[one.group] > _MUCH and (one.origin == "stated" or not stated)]
+    noise_left = np.average([log.noise_left for log in logs], weights=[len(log) for log in logs])
+    stated = any(group.origin == "stated" for group in noise.groups)
+    expected = float(np.sqrt(noise_left)) if stated else None
+    excess = {group.group: (group.residual or 0.0) / ((expected or 1.0) * group.used) for group in noise.groups}
+    beyond = [
+        group for group in noise.groups if excess[group.group] > _MUCH and (group.origin == "stated" or not stated)
+    ]
     growth = None
     if estimate.block_error is not None and (known := estimate.verdict == "identified").any():
         growth = float(np.median(estimate.block_error[known] / np.maximum(estimate.noise_error[known], 1e-300)))
@@ -355,7 +357,7 @@ def misfit(
         expected=expected,
         lack_of_fit=None if jackknife is None else jackknife.lack_of_fit,
         error_growth=growth,
-        groups=tuple(sorted(beyond, key=lambda one: -excess[one.group])),
+        groups=tuple(sorted(beyond, key=lambda group: -excess[group.group])),
         friction=friction,
         share=float(np.sqrt(estimate.cost / estimate.nominal_cost)) if estimate.nominal_cost > 0.0 else None,
     )
@@ -363,9 +365,9 @@ def misfit(
 
 def beyond_noise(estimate: Estimate) -> str:
     """That a fit leaves far more than the stated noise, far more than a `Misfit` says; "" where it does not."""
-    left = _residual(estimate)
-    found = f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
-    return found if left > _UNEXPLAINED else ""
+    residual = _residual(estimate)
+    found = f"forces differ from any rigid-body model by {residual:.3g} times the stated sensor noise"
+    return found if residual > _UNEXPLAINED else ""
 
 
 def unexplained_forces(
@@ -430,8 +432,8 @@ def unexplained_torques(fitted: Metrics, sensors: SensorSet | None = None) -> st
     if sensors is not None and not sensors.torque.any():
         groups.clear()
     noise = AT_THE_FLOOR * (fitted.noise.get("joint_torque") or 0.0)  # as large where projected on orthonormal axes
-    beyond = (one for one in groups if (fitted.rms_of(one) or 0.0) > noise)
-    share = max((fitted.relative_of(one) or 0.0 for one in beyond), default=0.0)
+    beyond = (group for group in groups if (fitted.rms_of(group) or 0.0) > noise)
+    share = max((fitted.relative_of(group) or 0.0 for group in beyond), default=0.0)
     return f"the fit leaves {100.0 * share:.3g} % of the joint torques" if share > _SHARE else ""
 
 
@@ -522,17 +524,17 @@ def unfitted_friction(problem: LinearProblem, robot: Robot) -> UnfittedFriction 
     kept = values > UNOBSERVABLE_SHARE
     explained = V[:, kept].T @ rows[:, -1]
     rank = int(kept.sum())
-    left = rows[:, -1] - V[:, kept] @ explained
-    cost = float(left @ left) + problem.residual
+    remainder = rows[:, -1] - V[:, kept] @ explained
+    cost = float(remainder @ remainder) + problem.residual
     noise = problem.oversampling * residual_std(cost, problem.rows, U.shape[1] + rank, problem.oversampling) ** 2
     inverse = Wh[kept].T / values[kept]
-    found = inverse @ explained
+    friction = inverse @ explained
     deviation = np.maximum(np.linalg.norm(inverse, axis=1), np.finfo(float).tiny)
-    order = np.argsort(-np.square(found / deviation).reshape(-1, 2).sum(axis=1))
+    order = np.argsort(-np.square(friction / deviation).reshape(-1, 2).sum(axis=1))
     shown = [joints[bodies[index]] for index in order]
     return UnfittedFriction(
         joints=tuple(joint.name for joint in shown),
-        values=(found / size).reshape(-1, 2)[order],
+        values=(friction / size).reshape(-1, 2)[order],
         units=tuple(_UNITS.get(joint.kind, _ROTARY) for joint in shown),
         ratio=float(explained @ explained) / max(rank * noise, np.finfo(float).tiny),
         combinations=rank,
@@ -545,7 +547,7 @@ _MOST_SAMPLES = 50_000  # evenly spaced
 def unmeasured_at_rest(logs: Sequence[Samples]) -> float | None:
     """Share of the joint torques of some logs that count as unmeasured, as joints rest; None where none does."""
     flags = [log.resting for log in logs if log.resting is not None and log.resting.numel()]
-    return float(sum(one.sum() for one in flags)) / sum(one.numel() for one in flags) if flags else None
+    return float(sum(resting.sum() for resting in flags)) / sum(resting.numel() for resting in flags) if flags else None
 
 
 def resting_joints(

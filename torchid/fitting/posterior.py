@@ -73,8 +73,8 @@ class FittedPosterior:
         """A width of the prior as a number; "auto" is the default one unless the data contradict it beyond chance."""
         if wanted != "auto":
             return wanted
-        found = self.nominal_error
-        return found.value if found is not None and found.clear else PRIOR_ERROR
+        error = self.nominal_error
+        return error.value if error is not None and error.clear else PRIOR_ERROR
 
 
 def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPosterior:
@@ -133,8 +133,8 @@ def _scale_of_prior(scale: Array, moved: Array) -> Array:
         moved: (12 L,), how far the estimate is from the nominal parameters.
     """
     out = scale.copy()
-    friction, found = (x.reshape(-1, PER_BODY)[:, parameters.FRICTION] for x in (out, np.abs(moved)))
-    friction[...] = np.maximum(friction, found / PRIOR_ERROR)
+    friction, moved_friction = (x.reshape(-1, PER_BODY)[:, parameters.FRICTION] for x in (out, np.abs(moved)))
+    friction[...] = np.maximum(friction, moved_friction / PRIOR_ERROR)
     return out
 
 
@@ -455,9 +455,9 @@ class RigidPlusResidual(nn.Module):
         try:
             state = torch.load(path, weights_only=True)
             phi = state["phi"].numpy()
-            own = state["residual"]
-            residual = residual or JointNetworks(robot.n, own["out"].shape[1])
-            residual.load_state_dict(own)
+            module_state = state["residual"]
+            residual = residual or JointNetworks(robot.n, module_state["out"].shape[1])
+            residual.load_state_dict(module_state)
             if phi.shape != (robot.nominal.size,) or not np.isfinite(phi).all():
                 raise ValueError(f"parameters of shape {phi.shape}")
         except OSError:

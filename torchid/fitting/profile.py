@@ -203,7 +203,7 @@ def choose_base_tilt(logs: Sequence[Samples], fitter: LogFitter) -> Profile:
         return float(fitter.fit(compress_parts(tilted, fitter.builder), estimator.solve).estimate.residual_std ** 2)
 
     level = max(squared_residual(np.zeros(2)), np.finfo(float).tiny)
-    found = minimize(
+    searched = minimize(
         lambda tilt: squared_residual(tilt) / level,
         np.zeros(2),
         method="L-BFGS-B",
@@ -211,20 +211,20 @@ def choose_base_tilt(logs: Sequence[Samples], fitter: LogFitter) -> Profile:
         bounds=[(-LARGEST_TILT, LARGEST_TILT)] * 2,
         options={"ftol": _TILT_SETTLED},
     )
-    share = math.sqrt(found.fun)
+    share = math.sqrt(searched.fun)
     is_better = share < 1.0 - _TILT_GAIN
-    if is_better and np.abs(found.x).max() >= LARGEST_TILT:
+    if is_better and np.abs(searched.x).max() >= LARGEST_TILT:
         warn(f"robot.base_tilt: {LARGEST_TILT:g} rad or more; is the base's orientation that of another frame?")
-    x, y = np.rad2deg(found.x)
+    x, y = np.rad2deg(searched.x)
     text = f"none: no tilt of the base explains more (the best leaves {share:.3g} of the residual with none)"
     if is_better:
         text = f"{x:.2f} and {y:.2f} degrees about the base's x and y axes, which leave {share:.3g} of the residual"
     return Profile(
-        value=(float(f"{found.x[0]:.4g}"), float(f"{found.x[1]:.4g}")) if is_better else (0.0, 0.0),
+        value=(float(f"{searched.x[0]:.4g}"), float(f"{searched.x[1]:.4g}")) if is_better else (0.0, 0.0),
         text=text,
-        tried=((0.0, 0.0), tuple(found.x.tolist())),
+        tried=((0.0, 0.0), tuple(searched.x.tolist())),
         error=(1.0, share),
-        best=tuple(found.x.tolist()),
+        best=tuple(searched.x.tolist()),
         share=share,
     )
 
@@ -288,12 +288,12 @@ def _profile(
         rejected = "the data do not determine it"
     elif rejected:
         rejected = f"{in_units(best)} ({span}): {rejected}"
-    left = f"{share:.3g} of the residual with none"
+    remainder = f"{share:.3g} of the residual with none"
     value: float | None = float(f"{best:.4g}")
-    text = f"{in_units(best)} ({span}), which leaves {left}"
+    text = f"{in_units(best)} ({span}), which leaves {remainder}"
     if needless or rejected:
         value = none
-        text = f"none: {needless or rejected} (the best leaves {left})"
+        text = f"none: {needless or rejected} (the best leaves {remainder})"
     return Profile(
         value=value,
         text=text,
@@ -393,7 +393,7 @@ def choose_sign_width(read: Callable[[float | None], Reading], kinds: Sequence[s
     none = "none: Coulomb friction with tanh(velocity / width) predicts left-out blocks no better"
     sign = read(None).left_out(kinds)
     gains = [Evidence.of(sign, read(width).left_out(kinds)) for width in _FIRST_WIDTHS]
-    if not any(one.certain and one.gain > _WIDTH_GAIN for one in gains):
+    if not any(evidence.certain and evidence.gain > _WIDTH_GAIN for evidence in gains):
         return Profile(None, none, (None,), (1.0,))
 
     def errors(width: float | None) -> tuple[float, Array]:
@@ -401,10 +401,10 @@ def choose_sign_width(read: Callable[[float | None], Reading], kinds: Sequence[s
         return math.sqrt(reading.noise_variance), reading.left_out(kinds)
 
     tried = (None, *_WIDTHS)
-    found = dict(zip(tried, share_between_forks(tried, errors, thread_count()), strict=True))
-    residual = {width: one for width, (one, _) in found.items()}
+    errors_of = dict(zip(tried, share_between_forks(tried, errors, thread_count()), strict=True))
+    residual = {width: evidence for width, (evidence, _) in errors_of.items()}
     best = min(residual, key=lambda width: residual[width])
-    width = next(x for x in tried if not Evidence.of(found[x][1], found[best][1]).certain)
+    width = next(x for x in tried if not Evidence.of(errors_of[x][1], errors_of[best][1]).certain)
     if width == best and width is not None:  # no other does as well
         place = _WIDTHS.index(width)
         bounds = np.log10([_WIDTHS[max(place - 1, 0)], _WIDTHS[min(place + 1, len(_WIDTHS) - 1)]])
@@ -470,9 +470,9 @@ def choose_data(read: Mapping[Any, Callable[[], Reading]], kinds: Sequence[str])
         InputError: the first leaves nothing.
     """
     readings: list[Reading] = []
-    for number, one in enumerate(read.values()):
+    for number, read_one in enumerate(read.values()):
         try:
-            reading = one()
+            reading = read_one()
         except InputError:  # nothing is left
             if not number:
                 raise

@@ -148,19 +148,19 @@ def fit_robustly(
         compress = partial(compress_parts, rough, builder)
         start = _passes(start, fitter, lambda weigh: compress(weight_rows=weigh), compress(), loss, 0, solve)
     compress_all = partial(compress_in_blocks, logs, builder, progress)
-    found = _passes(start, fitter, compress_all, parts, loss, _START if step >= _WORTHWHILE else 0, solve)
-    reweighting = found.reweighting
+    passes = _passes(start, fitter, compress_all, parts, loss, _START if step >= _WORTHWHILE else 0, solve)
+    reweighting = passes.reweighting
     if reweighting is None:
         raise ValueError(f"passes: found {loss.passes}; accepted: at least 1")
     summary = RobustSummary(
         loss=loss.kind,
         tuning=loss.tuning,
-        scale=found.scale,
+        scale=passes.scale,
         mean_weight=reweighting.mean_weight,
-        passes=found.done,
-        converged=found.converged,
+        passes=passes.done,
+        converged=passes.converged,
     )
-    return RobustFit(_with_errors(found.fit, reweighting), summary)
+    return RobustFit(_with_errors(passes.fit, reweighting), summary)
 
 
 @dataclass(frozen=True)
@@ -197,28 +197,28 @@ def _passes(
     """
     noise_gram = {part.key: part.factor.noise_gram for part in unweighted if part.factor.noise_gram}
     sources = {part.source for part in unweighted}
-    found = replace(start, done=0, converged=False)
-    while found.done < loss.passes and not found.converged:
+    passes = replace(start, done=0, converged=False)
+    while passes.done < loss.passes and not passes.converged:
         current = loss
-        if loss.kind != "huber" and first_pass + found.done < _START:  # Huber's loss is convex
+        if loss.kind != "huber" and first_pass + passes.done < _START:  # Huber's loss is convex
             current = replace(loss, kind="huber", tuning=TUNING["huber"])
-        at = found.at
-        scale = found.scale
+        at = passes.at
+        scale = passes.scale
         by_log = {source: at.columns(fitter.builder, source) for source in sources}
         reweighting = Reweighting(current, by_log, max(scale, _TINY))
         parts = compress(reweighting)
         add_noise_gram(parts, noise_gram, reweighting.mean_weight)
         fit = fitter.fit(parts, solve)
         same = current == loss and _has_converged(fit, at, scale, reweighting.median_scale)
-        found = _Passes(
+        passes = _Passes(
             fit=fit,
             at=_beyond(at, fit, min(reweighting.newton_ratio, _FARTHEST)),
             scale=reweighting.median_scale,
             reweighting=reweighting,
-            done=found.done + 1,
+            done=passes.done + 1,
             converged=distributed.broadcast(same, "convergence"),
         )
-    return found
+    return passes
 
 
 def _beyond(before: Fit, after: Fit, step: float) -> Fit:

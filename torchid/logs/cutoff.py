@@ -138,8 +138,8 @@ def choose_cutoff(
     least, end = (candidates[np.argmax(motion >= share * motion[last])] for share in (_KEPT_SHARE, _MOTION_SHARE))
     quiet = candidates[noise <= _NOISE_SHARE * motion[last]].max(initial=least)
     still = candidates[of_base <= _WEIGHT_SHARE * gravity].max(initial=candidates[0])
-    found = min(still, max(least, min(quiet, max(usual, _HARMONICS * end))))
-    return CutoffChoice(float(f"{found:.2g}"), by_noise=True, motion_hz=float(f"{end:.2g}"))
+    cutoff = min(still, max(least, min(quiet, max(usual, _HARMONICS * end))))
+    return CutoffChoice(float(f"{cutoff:.2g}"), by_noise=True, motion_hz=float(f"{end:.2g}"))
 
 
 def _powers(

@@ -101,10 +101,10 @@ def _rests(known: FloatArray, are_positions: bool, speed: FloatArray, timeline: 
     out = np.empty((len(timeline.output_stamps), rests.shape[1]), dtype=bool)
     together = channels_together(len(rests))
     for start in range(0, rests.shape[1], together):
-        own = slice(start, start + together)
-        at_rest = import_signal().fftconvolve(rests[:, own].astype(float), weights[:, None], mode="full", axes=0)
+        columns = slice(start, start + together)
+        at_rest = import_signal().fftconvolve(rests[:, columns].astype(float), weights[:, None], mode="full", axes=0)
         (share,) = timeline.evaluate(at_rest[len(weights) // 2 :][: len(rests)], (0,))
-        out[:, own] = share > (1.0 + _ROUNDING) * accepted
+        out[:, columns] = share > (1.0 + _ROUNDING) * accepted
     return out
 
 
@@ -174,8 +174,8 @@ def with_sign_filter(timeline: Timeline, log: Log, noise: SignalNoise) -> Timeli
 
 def with_signs_of(timeline: Timeline, whole: Timeline) -> Timeline:
     """The timeline of a segment with what `with_sign_filter` has found of the whole log."""
-    found = {name: getattr(whole, name) for name in ("sign_low_pass", "sign_noise", "rest_speed")}
-    return replace(timeline, **found)
+    of_log = {name: getattr(whole, name) for name in ("sign_low_pass", "sign_noise", "rest_speed")}
+    return replace(timeline, **of_log)
 
 
 def resting_share(velocity: FloatArray, noise: FloatArray | float = 0.0) -> FloatArray:
@@ -241,8 +241,8 @@ def wider_low_pass(log: Log, timeline: Timeline) -> WiderLowPass | None:
         values = np.diff(values, axis=0) / step
         correlation = correlation[0] / step**2 * np.array([2.0, -1.0])
     cutoffs = [cutoff * 2.0**k for k in range(1, _DOUBLINGS) if cutoff * 2.0**k < _WIDEST / step]
-    wider = [LowPass.butterworth(one, step) for one in cutoffs]
-    first, *errors = (_error(one, values, correlation) for one in [low_pass, *wider])
+    wider = [LowPass.butterworth(filter_, step) for filter_ in cutoffs]
+    first, *errors = (_error(filter_, values, correlation) for filter_ in [low_pass, *wider])
     power = float(np.square(values).mean(axis=0).sum())
     best = int(np.argmin([first, *errors])) - 1
     if best < 0 or first - errors[best] <= _EVIDENT * power:
