@@ -204,12 +204,13 @@ class EllipticalSlice(torch.nn.Module):
     weights: Tensor
     unit: Tensor
 
-    def __init__(self, conic: ConicProblem, gaussian: BarrierGaussian, owners: np.ndarray) -> None:
+    def __init__(self, gaussian: BarrierGaussian, variables: np.ndarray, E: Array, owners: np.ndarray) -> None:
         """Prepare.
 
         Args:
-            conic: the problem, without log-determinants in its objective.
-            gaussian: that stands for it.
+            gaussian: that stands for the problem.
+            variables: (K, 10) int, on which the blocks depend.
+            E: (Q, n), of the equalities.
             owners: (n,) int, to which body each variable belongs.
 
         Warns:
@@ -220,8 +221,8 @@ class EllipticalSlice(torch.nn.Module):
             "mean": gaussian.mean,
             "root": gaussian.root,
             "directions": gaussian.directions,
-            "block_variables": conic.variables,
-            "block_changes": np.take_along_axis(gaussian.blocks, conic.variables[:, None], axis=2),
+            "block_variables": variables,
+            "block_changes": np.take_along_axis(gaussian.blocks, variables[:, None], axis=2),
             "row_changes": gaussian.rows,
             "near": gaussian.near.astype(np.float64),
             "weights": ENTRY_WEIGHTS[:, None],
@@ -230,8 +231,8 @@ class EllipticalSlice(torch.nn.Module):
         for name, array in arrays.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)))
         self._groups = 0
-        for variables in (np.arange(len(owners)), *_pairs(gaussian, owners)):
-            self._add_group(gaussian, conic.E, variables)
+        for moving in (np.arange(len(owners)), *_pairs(gaussian, owners)):
+            self._add_group(gaussian, E, moving)
         self.moved = 1
         self.passes = 1  # groups that move in a pass, the first one all variables together
         self._measure()
@@ -470,19 +471,34 @@ class TruncatedGaussian(torch.nn.Module):
         """
         super().__init__()
         gaussian = barrier_gaussian(conic)
-        split = _Split.of(conic, gaussian)
         self.near = int(gaussian.near.sum())
         self.conditions = len(gaussian.near)
+        near_blocks, near_rows = np.split(gaussian.near, [len(conic.F0)])
+        is_near = conic.G[near_rows].any(axis=0) | conic.E.any(axis=0)
+        is_near[conic.variables[near_blocks]] = True
+        near = np.flatnonzero(is_near)
+        far = np.flatnonzero(~is_near)
+        blocks = is_near[conic.variables].all(axis=1)
+        rows = ~conic.G[:, far].any(axis=1)
         self.chains = None
-        if len(split.near):
-            self.chains = EllipticalSlice(*split.marginal(conic, gaussian), owners[split.near])
+        if len(near):
+            variables = (np.cumsum(is_near) - 1)[conic.variables[blocks]]
+            marginal = gaussian.marginal(near, blocks, rows)
+            self.chains = EllipticalSlice(marginal, variables, conic.E[:, near], owners[near])
+        columns = np.column_stack([conic.root[:, far], conic.root[:, near], conic.target])
+        triangle = np.asarray(np.linalg.qr(columns, mode="r"))[: len(far)]
+        given = np.column_stack([triangle[:, len(far) :], np.eye(len(far))])
+        solved = scipy.linalg.solve_triangular(triangle[:, : len(far)], given)
+        coupled, far_mean, far_root = np.split(solved, [len(near), len(near) + 1], axis=1)
         arrays = {
             "mean": gaussian.mean,
-            "near_variables": split.near,
-            "far_variables": split.far,
-            **split.given(conic),
-            "block_changes": gaussian.blocks[~split.blocks].reshape(-1, len(gaussian.mean)),
-            "row_changes": gaussian.rows[~split.rows],
+            "near_variables": near,
+            "far_variables": far,
+            "far_mean": far_mean[:, 0],
+            "far_gain": -coupled,
+            "far_root": far_root,
+            "block_changes": gaussian.blocks[~blocks].reshape(-1, len(gaussian.mean)),
+            "row_changes": gaussian.rows[~rows],
             "unit": np.eye(4)[np.triu_indices(4)][:, None],
         }
         for name, array in arrays.items():
@@ -534,67 +550,3 @@ class TruncatedGaussian(torch.nn.Module):
         change = x - self.mean[:, None]
         blocks = (self.block_changes @ change).view(-1, 10, x.shape[1]) + self.unit
         return x[:, inside(blocks, self.row_changes @ change)]
-
-
-@dataclass(frozen=True)
-class _Split:
-    """Which variables and conditions are left to chains.
-
-    Attributes:
-        near, far: variables that conditions nearby or equalities concern, and the others.
-        blocks, rows: (K,), (M,) bool, the conditions on the former alone.
-        triangle: (n, n + 1), the upper triangular root and the target of the quadratic, `far` before `near`.
-    """
-
-    near: np.ndarray
-    far: np.ndarray
-    blocks: np.ndarray
-    rows: np.ndarray
-    triangle: Array
-
-    @classmethod
-    def of(cls, conic: ConicProblem, gaussian: BarrierGaussian) -> _Split:
-        near_blocks, near_rows = np.split(gaussian.near, [len(conic.F0)])
-        chosen = conic.G[near_rows].any(axis=0) | conic.E.any(axis=0)
-        chosen[conic.variables[near_blocks]] = True
-        near = np.flatnonzero(chosen)
-        far = np.flatnonzero(~chosen)
-        columns = np.column_stack([conic.root[:, far], conic.root[:, near], conic.target])
-        triangle = np.asarray(np.linalg.qr(columns, mode="r"))
-        blocks = chosen[conic.variables].all(axis=1)
-        rows = ~conic.G[:, far].any(axis=1)
-        return cls(near, far, np.asarray(blocks), np.asarray(rows), triangle)
-
-    def marginal(self, conic: ConicProblem, gaussian: BarrierGaussian) -> tuple[ConicProblem, BarrierGaussian]:
-        """The problem of the variables that chains sample, whatever the others are, and its Gaussian."""
-        place = np.zeros(len(conic.linear), dtype=np.int64)
-        first = len(self.far)
-        last = len(conic.linear)
-        place[self.near] = np.arange(len(self.near))
-        kept = np.concatenate([self.blocks, self.rows])
-        problem = replace(
-            conic,
-            root=self.triangle[first:last, first:last],
-            target=self.triangle[first:last, last],
-            linear=conic.linear[self.near],
-            F0=conic.F0[self.blocks],
-            F=conic.F[self.blocks],
-            variables=place[conic.variables[self.blocks]],
-            weights=conic.weights[self.blocks],
-            G=conic.G[self.rows][:, self.near],
-            h=conic.h[self.rows],
-            E=conic.E[:, self.near],
-            names=tuple(name for name, keep in zip(conic.names, kept, strict=True) if keep),
-            deviations=conic.deviations[:, self.near],
-        )
-        return problem, gaussian.marginal(self.near, self.blocks, self.rows)
-
-    def given(self, conic: ConicProblem) -> dict[str, Array]:
-        """The Gaussian of the others given the former: mean `far_mean + far_gain @ near` and root of the covariance."""
-        first = len(self.far)
-        last = len(conic.linear)
-        root = self.triangle[:first, :first]
-        wanted = self.triangle[:first, first : last + 1]
-        solved = scipy.linalg.solve_triangular(root, np.column_stack([wanted, np.eye(first)]))
-        coupled, mean, far_root = np.split(solved, [last - first, last - first + 1], axis=1)
-        return {"far_mean": mean[:, 0], "far_gain": -coupled, "far_root": far_root}
