@@ -291,8 +291,7 @@ class Misfit:
     @property
     def explained(self) -> bool:
         """Whether noise may be all that the model leaves."""
-        much = self.expected is not None and self.residual > _MUCH * self.expected
-        return not (much or self.alike or (self.friction is not None and self.friction.significant))
+        return not self._reasons()
 
     def _reasons(self) -> list[str]:
         """Why noise cannot be all that the model leaves, none where it may be."""
