@@ -124,9 +124,8 @@ class ConicProblem:
         """Names of conditions from whose border x (n,) is no further than a tolerance; an entropic prior is none."""
         blocks, rows = np.split(self.slack(x), [4 * len(self.F0)])
         slack = np.append(np.where(self.weights > 0.0, np.inf, blocks.reshape(-1, 4).min(axis=1, initial=np.inf)), rows)
-        return tuple(
-            dict.fromkeys(name for name, distance in zip(self.names, slack, strict=True) if distance <= tolerance)
-        )
+        near = slack <= tolerance
+        return tuple(dict.fromkeys(name for name, is_near in zip(self.names, near, strict=True) if is_near))
 
     def gradient(self, x: Array) -> Array:
         """Gradient of the quadratic and the linear term, (n,)."""
@@ -422,11 +421,9 @@ def _inequalities(x: _Scaled, problem: LinearProblem, conditions: Conditions) ->
             limit = sign * float(bound[body, number] / x.scale[body, number])
             out.append(x.condition(name, {(body, number): sign}, limit))
     if terms is not None:
-        for condition in terms.conditions_at(problem.free, problem.nominal):
-            weights = (
-                np.concatenate([condition.parameters * problem.scale, condition.terms * terms.size]) / condition.size
-            )
-            out.append(x.condition(condition.name, weights, 0.0))
+        for known in terms.conditions_at(problem.free, problem.nominal):
+            weights = np.concatenate([known.parameters * problem.scale, known.terms * terms.size]) / known.size
+            out.append(x.condition(known.name, weights, 0.0))
     return out
 
 

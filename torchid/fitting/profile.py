@@ -109,8 +109,8 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
     sloped = with_terms(fitter, replace(terms, slope=True))
     trial, torques = (_torques(logs, fitter, count) for count in (_DELAY_TRIAL_SAMPLES, _SAMPLES))
 
-    def delayed(some: Sequence[_Torques], delay: float) -> list[Samples]:
-        return [log.by(delay) for log in some]
+    def delayed(splines: Sequence[_Torques], delay: float) -> list[Samples]:
+        return [log.by(delay) for log in splines]
 
     error = share_between_forks(_DELAYS.tolist(), lambda x: _residual(delayed(trial, x), plain), thread_count())
     start = float(_DELAYS[int(np.argmin(error))])
