@@ -478,8 +478,8 @@ class TruncatedGaussian(torch.nn.Module):
         is_near[conic.variables[near_blocks]] = True
         near = np.flatnonzero(is_near)
         far = np.flatnonzero(~is_near)
-        blocks = is_near[conic.variables].all(axis=1)
-        rows = ~conic.G[:, far].any(axis=1)
+        blocks = np.asarray(is_near[conic.variables].all(axis=1))
+        rows = np.asarray(~conic.G[:, far].any(axis=1))
         self.chains = None
         if len(near):
             variables = (np.cumsum(is_near) - 1)[conic.variables[blocks]]

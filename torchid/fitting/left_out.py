@@ -478,7 +478,7 @@ def sum_residuals(
         for number, calibration in enumerate(calibrations):
             residual = R[:, :-1] @ calibration.columns(builder, log).cpu() - R[:, -1]
             sums[number] += float(residual @ residual), measured, rows * log.noise_left, rows
-    return [ResidualSquares(*squares, rows=int(rows)) for *squares, rows in sums.tolist()]
+    return [ResidualSquares(error, measured, noise, int(rows)) for error, measured, noise, rows in sums.tolist()]
 
 
 RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
