@@ -36,14 +36,24 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 REFUSED = {
     "sensors": (["sensors.set=full"], "sensors: without front_left_foot fx"),
+    "other sensors": (["sensors.set=contacts", "sensors.on_base_lost=warn"], "sensors: without front_left_foot fx"),
     "filter": (["preprocessing.cutoff_hz=9"], "preprocessing.cutoff_hz: 8; accepted: 9, as in the experiment file"),
+    "no filter": (["preprocessing.cutoff_hz=null"], "preprocessing.cutoff_hz: 8; accepted: none"),
     "margin": (["preprocessing.contact_margin_s=0.1"], "preprocessing.contact_margin_s: none; accepted: 0.1"),
     "extras": (["sensors.offsets=log"], "sensors.offsets: without offset of front_left_hip, by log"),
     "scales": (["sensors.scales=all"], "sensors.scales: without scale of front_left_hip, of all logs"),
     "actuators": (["actuators.armature=true"], "actuators: without armature of front_left_hip"),
+    "tilt": (["robot.base_tilt=[0.1, 0]"], "robot.base_tilt: none; accepted: 0.1, 0.0, as in the experiment file"),
+    "sign": (["actuators.sign_width=0.1"], "actuators.sign_width: none; accepted: 0.1"),
+    "delay": (["actuators.delay=0.003"], "actuators.delay: none; accepted: 0.003, as in the experiment file"),
     "contacts": (
         ["contacts=[{frame: front_left_foot, type: point}, {frame: front_right_foot, type: point}]"],
         "contacts: with rear_left_foot (point), rear_right_foot (point)",
+    ),
+    "contact type": (
+        ["contacts=[{frame: front_left_foot, type: flat}, {frame: front_right_foot, type: point}, "
+         "{frame: rear_left_foot, type: point}, {frame: rear_right_foot, type: point}]"],
+        "contacts: without front_left_foot (flat) and with front_left_foot (point)",
     ),
     "radius": (
         ["contacts=[{frame: front_left_foot, type: point, radius: 0.02}, {frame: front_right_foot, type: point}, "
@@ -168,22 +178,30 @@ ONE_NOISE = "one noise of all joints, as once"
 HOSTILE: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
     "a later format": lambda d, a: d.update(format=FORMAT + 1),
     "no pieces": lambda d, a: d.update(pieces=[]),
+    "no states": lambda d, a: d.update(by_state=[]),
     "samples": lambda d, a: d.update(samples=199),
     "a billion samples": lambda d, a: d.update(samples=10**15),
     "too many blocks": lambda d, a: d.update(blocks=1000),
     "a column that is none": lambda d, a: d["supports"][0].append(d["settings"]["columns"]),
     "another state": lambda d, a: first_part(d).update(state="11"),
+    "another span": lambda d, a: first_part(d).update(samples=first_part(d)["samples"] + 1),
     "a state twice": lambda d, a: d["by_state"][0].update(state=d["by_state"][1]["state"]),
     "air that is no block": lambda d, a: d["unloaded"].append([1, 3, []]),
+    "a triangle too many": lambda d, a: first_part(d)["blocks"].append([0, 1]),
     "more rows than a triangle has": lambda d, a: first_part(d)["blocks"][0].__setitem__(1, 10**6),
+    "independent rows": lambda d, a: first_part(d).update(independent_rows=1e300),
     "contacts as a number": lambda d, a: d["settings"].update(contacts=3.0),
     "negative noise": lambda d, a: d["noise"].update({"joint_torque.front_left_hip": -1.0}),
+    "noise of nothing": lambda d, a: d["noise"].update({"base_force.x": 1e-300}),
     "noise far from the others": lambda d, a: d["noise"].update({"base_force.x": 1e6, "base_force.y": 1e-6}),
     ONE_NOISE: lambda d, a: d.update(
         noise={"joint_torque": 0.1} | {name: x for name, x in d["noise"].items() if "joint_torque" not in name}
     ),
+    "a longer tree": lambda d, a: a.update(T_parent_joint=np.zeros((99, 4, 4))),
     "no tree": lambda d, a: a.pop("joint_map"),
     "NaN": lambda d, a: a["values"].__setitem__(5, np.nan),
+    "numbers beyond all sense": lambda d, a: a["values"].__setitem__(5, 1e200),
+    "fewer numbers": lambda d, a: a.update(values=a["values"][:-1]),
     "more numbers": lambda d, a: a.update(values=np.append(a["values"], 0.0)),
     "text for numbers": lambda d, a: a.update(values=np.array(["a", "b"])),
 }
