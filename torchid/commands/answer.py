@@ -36,7 +36,8 @@ from torchid.report.tables import noise_advice
 from torchid.report.urdf_files import massless_ends
 from torchid.reprs import decimal
 
-_FEW_GROUPS, _FEW_NAMED = 2, 4
+_FEW_GROUPS = 2
+_FEW_NAMED = 4
 _WIDTH = 108  # of a line of a summary
 _IN_PART = " in part"
 #: By the least and the largest error of a group of rows, as shares of the URDF's.
@@ -112,7 +113,9 @@ _EXACT_SHARE = 1e-3  # of what the nominal parameters leave: signals without noi
 _CLEAR_ERRORS = 4.0  # standard errors of a total mass from which on it is not the URDF's
 _HEAVY = 2.0  # times the mass in the robot's file
 _COMPUTED = 1e-3  # of the measured, to which no file predicts what a real robot does: friction alone is more
-_ALIKE, _DIFFERENT, _SAME_STEP = 0.2, 1.5, 0.1  # of armatures over kd, relative; of gains; of a step, relative
+_ALIKE = 0.2  # relative differences of armatures over kd, below which they are one time
+_DIFFERENT = 1.5  # ratio of gains
+_SAME_STEP = 0.1  # relative difference of two steps of time
 _ANOTHER_ROBOT = 1.0  # of each body that data determine: no file of the same robot is off by so much
 
 

@@ -17,7 +17,9 @@ from typing import Any
 from torchid.errors import ConfigError, current_file, excerpt, join_names
 from torchid.staging import NEW, OLD, interrupts_deferred, leftovers, lock, note_written, staging_folder, take_over
 
-MANIFEST, CHECKPOINT, EVENTS = "manifest.json", "checkpoint.pt", "events.out.tfevents*"
+MANIFEST = "manifest.json"
+CHECKPOINT = "checkpoint.pt"
+EVENTS = "events.out.tfevents*"
 EVALUATIONS = "evaluation"
 """The folder in that of a run which holds its evaluations."""
 

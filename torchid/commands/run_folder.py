@@ -65,7 +65,8 @@ from torchid.staging import atomic_file
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PAGE, DATA = "report.html", "report.json"
+PAGE = "report.html"
+DATA = "report.json"
 _JSON = ("parameters.json", "metrics.json", DATA)
 
 _WRITTEN = "a folder that this version of torchid identify wrote"

@@ -25,13 +25,14 @@ from torchid.logs.containers import READABLE
 from torchid.settings import accepted_values
 
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_TAG, _MAX_ALIASES = "tag:yaml.org,2002:", 100
+_TAG = "tag:yaml.org,2002:"
+_MAX_ALIASES = 100
 _FLOAT = re.compile(
     r"[-+]?([0-9][0-9_]*\.[0-9_]*([eE][-+]?[0-9]+)?|[0-9][0-9_]*[eE][-+]?[0-9]+|\.[0-9_]+([eE][-+]?[0-9]+)?"
     r"|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$"
 )
-#: Characters that YAML keeps for itself, and what its reader says of them.
-_RESERVED, _CANNOT_BEGIN = "%@`", "cannot start any token"
+_RESERVED = "%@`"  # characters that YAML keeps for itself
+_CANNOT_BEGIN = "cannot start any token"  # what its reader says of them
 _WIDTH = 114  # of a line that is written, without its indent
 _BRACKETS = '; names with brackets take quotes in a list: ["walk.npz[0:30]"]'
 
@@ -118,7 +119,8 @@ def explain_syntax(error: yaml.MarkedYAMLError, text: str, wanted: str) -> tuple
     lines = text.splitlines()
     if mark is None:
         return excerpt(str(error)), wanted
-    line, where = lines[mark.line] if mark.line < len(lines) else "", f"line {mark.line + 1}"
+    line = lines[mark.line] if mark.line < len(lines) else ""
+    where = f"line {mark.line + 1}"
     shown = excerpt(line.strip())
     if "\t" in line[: len(line) - len(line.lstrip())]:
         return f"{where}: a tab before '{shown}'", "spaces in front of a key"
@@ -153,7 +155,8 @@ def yaml_lines(key: str, value: object) -> list[str]:
 _NO_YAML = (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
 _LONGEST = 300  # characters of another package's message that a message of ours repeats
 _KEY = re.compile(r"[^.\[\]]+(\.[^.\[\]]+|\[[^.\[\]]+\])*")
-_LONGEST_NAME, _LONGEST_PATH = 255, 4095  # bytes, of file systems
+_LONGEST_NAME = 255  # bytes, of file systems
+_LONGEST_PATH = 4095
 
 T = TypeVar("T")
 Settings = dict[str, Any]

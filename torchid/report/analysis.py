@@ -26,8 +26,9 @@ from torchid.sensor_planning.planner import PartPlan, SensorPlan
 #: Columns of text.
 _WIDTH = 100
 _LONGEST_NAME = 20  # of a sensor set that a table does not break
-#: Sets and remedies that are listed, and directions of the base.
-_MAX_SETS, _MAX_REMEDIES, _BASE_DIRECTIONS = 5, 8, 6
+_MAX_SETS = 5  # that are listed
+_MAX_REMEDIES = 8
+_BASE_DIRECTIONS = 6
 #: Smallest singular value of S_b V_x: below, the noise of the base's rows is a thousand times that of the sensors.
 _MIN_SINGULAR_VALUE = 1e-3
 

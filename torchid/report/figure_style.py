@@ -21,7 +21,10 @@ from torchid.errors import during, escape
 from torchid.parallel import share_between_forks, thread_count
 
 # the palette of Okabe and Ito, which the colour-blind tell apart
-MEASURED_COLOR, NOMINAL_COLOR, IDENTIFIED_COLOR, NOISE_COLOR = "#111111", "#d55e00", "#0072b2", "#8c8c8c"
+MEASURED_COLOR = "#111111"
+NOMINAL_COLOR = "#d55e00"
+IDENTIFIED_COLOR = "#0072b2"
+NOISE_COLOR = "#8c8c8c"
 """Of measured forces, of the URDF's and of identified parameters and what they predict, and of noise."""
 
 CATEGORY_COLORS = ("#56b4e9", "#f0e442", "#009e73", "#cc79a7", "#e69f00", NOISE_COLOR, IDENTIFIED_COLOR, NOMINAL_COLOR)
@@ -40,12 +43,13 @@ STYLE: dict[Any, Any] = {
     "pdf.fonttype": 42,  # letters that editors keep and journals accept
     "svg.hashsalt": "torchid",  # the same figure is the same file
 }
-#: Up to which power of ten axes have plain numbers, and how far off a power rounding is.
-_PLAIN_DECADES, _ROUNDING = 3.0, 1e-9
+_PLAIN_DECADES = 3.0  # power of ten up to which axes have plain numbers
+_ROUNDING = 1e-9  # of a power of ten
 _FEW_DECADES = 1e3  # span of an axis on which 2 and 5 are labelled, too
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-#: Room of `draw_panels` at the left, with numbers and a unit, at the right, and between columns [inches].
-_LEFT, _RIGHT, _ACROSS = 0.8, 0.1, 0.6
+_LEFT = 0.8  # inches beside the panels of `draw_panels`, for numbers and a unit
+_RIGHT = 0.1
+_ACROSS = 0.6  # inches between columns
 _HEADLINE = 0.08  # inches above a title
 #: 5 % larger than with the usual 6, in two thirds of the time.
 _COMPRESSION = 3

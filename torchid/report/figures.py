@@ -135,9 +135,11 @@ def _legend(axis: Axes, of: str, impossible: bool) -> list[matplotlib.artist.Art
     ]
 
 
-#: Rows of a panel (`parameters.json` has all), longest error bar that is whole over the largest value, the longest of
-#: all over this, its margin beside these as a share of the panel, and vertical offsets for logs in one row.
-_MAX_PANEL_ROWS, _MAX_ERROR_RATIO, _ENDLESS, _MARGIN, _LANES = 40, 4, 1e3, 0.05, 5
+_MAX_PANEL_ROWS = 40  # `parameters.json` has all
+_MAX_ERROR_RATIO = 4  # longest error bar that is whole, over the largest value
+_ENDLESS = 1e3  # longest error bar of all, over this
+_MARGIN = 0.05  # beside the bars, as a share of the panel
+_LANES = 5  # vertical offsets of logs in one row
 
 
 @matplotlib.rc_context(STYLE)
@@ -291,9 +293,14 @@ def equivalent_ellipsoid(phi: Array) -> tuple[Array, Array] | None:
 
 _FLOOR = "noise of the readings alone"
 _MOST_BARS = 20  # of a kind of contributions
-#: Colors of sensors and links in the tree, and its column width, row height and legend width [inches].
-_TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = IDENTIFIED_COLOR, "#009e73", "#cc79a7", "0.75", "0.3"
-_COLUMN, _ROW, _LEGEND = 2.1, 0.3, 7.4
+_TORQUE = IDENTIFIED_COLOR  # colors of sensors and links in the tree
+_WRENCH = "#009e73"
+_LIMB = "#cc79a7"
+_PLAIN = "0.75"
+_LOADED = "0.3"
+_COLUMN = 2.1  # inches of a column of the tree
+_ROW = 0.3  # likewise of a row
+_LEGEND = 7.4  # likewise of its legend
 
 Position = tuple[float, int]
 """Column and row in the figure of a tree."""

@@ -35,9 +35,11 @@ _SHOWN = 1.6  # errors are shown up to so many times the largest of the identifi
 _BINS = 1000  # of an envelope, each a minimum and a maximum
 _MOST_SPANS = 300  # of contact states
 _NAMED_STATES = 11  # in the legend
-_CURVES, _LEGEND_ROW = 4, 0.2  # entries of the legend beside those, and height of a row [inches]
+_CURVES = 4  # entries of the legend beside those
+_LEGEND_ROW = 0.2  # inches
 _GAP = 5.0  # median steps that are a gap
-_SHORTEST, _LONGEST = 64, 1024  # samples of a window of a spectrum
+_SHORTEST = 64  # samples of a window of a spectrum
+_LONGEST = 1024
 _BEYOND = 2.0  # frequencies are shown up to so many times the band of the noise
 
 

@@ -24,10 +24,11 @@ from torchid.logs.time_range import log_title
 from torchid.report.figure_style import IDENTIFIED_COLOR, NOMINAL_COLOR, STYLE, label_ticks
 
 COLORS = {REJECTED: NOMINAL_COLOR, SUSPICIOUS: "#e69f00", NOTE: IDENTIFIED_COLOR}
-#: Height of a row and of a panel's title, and width of the figure [inches].
-_ROW, _HEAD, _WIDTH = 0.16, 1.0, 10.0
-#: Characters of a title's line at font size 9, and of a title.
-_LINE_LETTERS, _TITLE_LETTERS = 130, 600
+_ROW = 0.16  # inches
+_HEAD = 1.0  # inches of a panel's title
+_WIDTH = 10.0  # inches of the figure
+_LINE_LETTERS = 130  # of a title, at font size 9
+_TITLE_LETTERS = 600
 #: Points of a curve.
 _MAX_POINTS = 2000
 #: Width of a mark over that of the panel: a single sample of a long log stays visible.

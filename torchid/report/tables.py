@@ -266,7 +266,8 @@ def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
     return make_table(title, ("body", "condition", "off by"), rows, left=("condition",))
 
 
-_MAX_COLUMNS, _MAX_ROWS = 4, 30
+_MAX_COLUMNS = 4
+_MAX_ROWS = 30
 
 
 def extra_table(extras: Sequence[ExtraEstimate]) -> Table:

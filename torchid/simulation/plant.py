@@ -111,7 +111,8 @@ def find_feet(settings: list[FootConfig], urdf: Path) -> tuple[Foot, ...]:
 
 def _sphere(urdf: Path, frame: str, shape: object) -> tuple[tuple[float, float, float], float] | None:
     """Centre and radius [m] of a collision shape in its link's frame, None unless it is a sphere."""
-    sphere, origin = shape.find("geometry/sphere"), shape.find("origin")  # type: ignore[attr-defined]
+    sphere = shape.find("geometry/sphere")  # type: ignore[attr-defined]
+    origin = shape.find("origin")  # type: ignore[attr-defined]
     if sphere is None:
         return None
     try:
@@ -211,7 +212,9 @@ def _hold(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, position: float) -> None:
 
 def set_inertial(body: mujoco.MjsBody, values: Array) -> None:
     """Replace the inertial parameters of a body with others, (10,)."""
-    body.mass, body.inertia, body.fullinertia[:] = 0.0, np.zeros(3), np.nan  # none of the last, for MuJoCo
+    body.mass = 0.0
+    body.inertia = np.zeros(3)
+    body.fullinertia[:] = np.nan  # none, for MuJoCo
     if values[parameters.MASS]:
         body.mass, com, inertia = parameters.mass_com_inertia(values)
         body.ipos = com
@@ -561,7 +564,8 @@ def _lumped_inertials(urdf: Path) -> dict[str, Array]:
         carrier = link.name
         T = np.eye(4)
         while carrier in fixed:
-            carrier, T = fixed[carrier].parent, joint_origin(fixed[carrier]) @ T
+            T = joint_origin(fixed[carrier]) @ T
+            carrier = fixed[carrier].parent
         out[carrier] += link_parameters(link, T)[parameters.INERTIAL]
     return out
 

@@ -19,7 +19,8 @@ from torchid.simulation.plant import Followers, Foot, JointConstraints, compile_
 _PHYSICS_HZ = 1000.0
 # Rates of decay by damping [1/s] from _PHYSICS_HZ on are for an implicit integrator: Runge and Kutta's would diverge.
 _LONGEST_GAP = 2.5  # median sampling intervals, within a window
-_FEWEST, _MOST_WINDOWS = 2, 500
+_FEWEST = 2  # sampling intervals of a window
+_MOST_WINDOWS = 500
 
 
 @dataclass(frozen=True)

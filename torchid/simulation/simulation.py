@@ -20,21 +20,24 @@ from torchid.problem.floor_pose import rolled_distance
 from torchid.sensing.sensors import NORMAL_INDEX
 from torchid.simulation.plant import Foot, FootMotion, Plant, find_feet, form_polygon, rotation_error
 
-_STIFFNESS, _DAMPING = 100.0, 20.0  # 1/s^2, 1/s: errors decay within half a second, without overshoot
-_CREEP, _FOOT_DAMPING = 100.0, 20.0  # 1/s^2, 1/s, of a foot that stands: friction holds it, but lets it creep
-_CONSTRAINED, _STANDING, _CENTRE, _TURN, _SWING, _JOINT, _POSTURE = (
-    1000.0,
-    100.0,
-    10.0,
-    10.0,
-    10.0,
-    3.0,
-    0.05,
-)  # weights
+_STIFFNESS = 100.0  # 1/s^2: errors decay within half a second, without overshoot
+_DAMPING = 20.0  # 1/s
+_CREEP = 100.0  # 1/s^2, of a foot that stands: friction holds it, but lets it creep
+_FOOT_DAMPING = 20.0  # 1/s
+_CONSTRAINED = 1000.0  # weights of tasks
+_STANDING = 100.0
+_CENTRE = 10.0
+_TURN = 10.0
+_SWING = 10.0
+_JOINT = 3.0
+_POSTURE = 0.05
 ALOFT = 1e-3  # a foot that carries a smaller share than this is off the floor
-_PREVIEW, _SMOOTH = 0.02, 0.05  # s, rad/s: friction is that of the velocity to come, and smooth where it turns
-_TRIES, _LEAST_POINTS = 3, 3
-_ITERATIONS, _LARGEST_STEP = 300, 0.2
+_PREVIEW = 0.02  # s: friction is that of the velocity to come
+_SMOOTH = 0.05  # rad/s, where friction turns
+_TRIES = 3
+_LEAST_POINTS = 3
+_ITERATIONS = 300
+_LARGEST_STEP = 0.2
 _SINGULAR = 1e-4  # share of the largest singular value
 _TOLERANCE = 1e-3  # m or rad
 _STEEPEST = np.radians(40.0)  # that a sole may be off the horizontal in the given posture
@@ -668,7 +671,8 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
         InputError: a delay of no sample, or of all.
     """
     name = name or truth.source
-    torque, wrench, along = _require_field(truth, "joint_torque"), *_foot_readings(truth)
+    torque = _require_field(truth, "joint_torque")
+    wrench, along = _foot_readings(truth)
     if sensors.delay.enabled:
         step = float(np.median(np.diff(truth.time)))
         late = round(sensors.delay.feet_s / step)

@@ -36,7 +36,8 @@ from torchid.report.log_checks import finding_table, group_alike, log_heading, s
 from torchid.report.tables import LINES, labelled, rolling_lines, rows_within, wrap_words, written_line
 from torchid.sensor_planning.observability import BaseObservability
 
-_MOST_ATTENTION, _TEXT_LINES = 2, 2
+_MOST_ATTENTION = 2
+_TEXT_LINES = 2
 _MOST_SCENARIOS = 4
 
 

@@ -19,7 +19,7 @@ from torchid.errors import format_count, join_names
 from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
 from torchid.fitting.noise import Misfit
-from torchid.parameters import COULOMB, MASS, PARAMETERS, PER_BODY, Array
+from torchid.parameters import COULOMB, FIRST_MOMENT, MASS, PARAMETERS, PER_BODY, VISCOUS, Array
 from torchid.problem.metrics import (
     DECISIVE_GROUPS,
     PRESSURE,
@@ -55,10 +55,10 @@ from torchid.reprs import decimal
 from torchid.robot import Robot
 from torchid.sensing.sensors import minimized_errors
 
-_MOST_ATTENTION, _TEXT_LINES, _ATTENTION_LINES = 2, 2, 3
+_MOST_ATTENTION = 2
+_TEXT_LINES = 2
+_ATTENTION_LINES = 3
 _FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
-_MASS, _CENTER = PARAMETERS.index("m"), slice(PARAMETERS.index("mcx"), PARAMETERS.index("mcz") + 1)
-_COULOMB, _VISCOUS = PARAMETERS.index("fc"), PARAMETERS.index("fv")
 _LEGEND = {
     COMBINED: "+ known only in sums with other bodies",
     PRIOR: "p mostly the {of}'s",
@@ -110,7 +110,7 @@ def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list
     lines = column_lines(("body", names), columns, width)
     marks = {word for line in lines[1:] for word in line.split()[1:]}
     if len(free) > len(shown):
-        what = "mass" if (estimate.phi.reshape(-1, PER_BODY) != robot.nominal)[free, _MASS].any() else "friction"
+        what = "mass" if (estimate.phi.reshape(-1, PER_BODY) != robot.nominal)[free, MASS].any() else "friction"
         lines.append(f"and {len(free) - len(shown)} bodies whose {what} changed less: --verbose")
     legend = "; ".join(text.format(of=robot.format) for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks)
     return [*lines, *([shorten(legend, width, placeholder=CUT)] if legend else [])]
@@ -121,7 +121,7 @@ def _most_changed(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> li
     phi = estimate.phi.reshape(-1, PER_BODY)
     nominal = robot.nominal
     moved = np.abs(phi - nominal)
-    return sorted(bodies, key=lambda k: (-moved[k, _MASS], -moved[k, _COULOMB], k))
+    return sorted(bodies, key=lambda k: (-moved[k, MASS], -moved[k, COULOMB], k))
 
 
 def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tuple[str, list[str]]]:
@@ -131,13 +131,13 @@ def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tu
     nominal = robot.nominal
 
     def cells(parameter: int) -> list[str]:
-        if parameter != _MASS and set(verdict[:, parameter]) <= {FIXED, UNOBSERVABLE}:
+        if parameter != MASS and set(verdict[:, parameter]) <= {FIXED, UNOBSERVABLE}:
             return [""] * len(bodies)  # friction, of which sensors outside of the joints tell nothing
         return [_cell(*(x[k, parameter] for x in (phi, error, verdict))) for k in bodies]
 
     masses = [
-        cell if "±" in cell or not cell else f"{decimal(phi[k, _MASS])} {cell[-1]}"
-        for k, cell in zip(bodies, cells(_MASS), strict=True)
+        cell if "±" in cell or not cell else f"{decimal(phi[k, MASS])} {cell[-1]}"
+        for k, cell in zip(bodies, cells(MASS), strict=True)
     ]
 
     joints = [robot.bodies[k].joint for k in bodies]
@@ -146,10 +146,10 @@ def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tu
     moved = [_center_moved(nominal[k], phi[k], verdict[k]) for k in bodies]
     return [
         ("mass [kg]", masses),
-        (f"{robot.format} [kg]", [decimal(nominal[k, _MASS]) for k in bodies]),
+        (f"{robot.format} [kg]", [decimal(nominal[k, MASS]) for k in bodies]),
         ("CoM moved [mm]", moved),
-        (f"Coulomb [{force}]", cells(_COULOMB)),
-        (f"viscous [{_per_speed(kinds)}]", cells(_VISCOUS)),
+        (f"Coulomb [{force}]", cells(COULOMB)),
+        (f"viscous [{_per_speed(kinds)}]", cells(VISCOUS)),
     ]
 
 
@@ -172,10 +172,10 @@ def _cell(value: float, error: float, verdict: str) -> str:
 
 def _center_moved(nominal: Array, phi: Array, verdict: np.ndarray) -> str:
     """Distance between both centres of mass."""
-    if (verdict[_CENTER] == FIXED).all() or min(nominal[_MASS], phi[_MASS]) <= 0.0:
+    if (verdict[FIRST_MOMENT] == FIXED).all() or min(nominal[MASS], phi[MASS]) <= 0.0:
         return ""
-    distance = np.linalg.norm(phi[_CENTER] / phi[_MASS] - nominal[_CENTER] / nominal[_MASS])
-    return f"{1e3 * distance:.0f} {_MARKS[COMBINED] if (verdict[_CENTER] == COMBINED).any() else ' '}"
+    distance = np.linalg.norm(phi[FIRST_MOMENT] / phi[MASS] - nominal[FIRST_MOMENT] / nominal[MASS])
+    return f"{1e3 * distance:.0f} {_MARKS[COMBINED] if (verdict[FIRST_MOMENT] == COMBINED).any() else ' '}"
 
 
 _NAMED = 6  # conditions
