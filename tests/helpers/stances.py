@@ -13,7 +13,7 @@ from synthetic import Array, Oracle
 from walking import MACHINES, Machine, reach, robot_of
 
 from torchid.logs import Log
-from torchid.problem.floor_pose import rolled_distance
+from torchid.problem.base_pose import rolled_distance
 from torchid.sensing import Contact
 
 RATE = 100.0

@@ -28,11 +28,11 @@ from torchid.logs.preprocess import away_from_stamps, find_unloaded
 from torchid.problem import Samples, contact_detection
 from torchid.problem.contact_detection import (
     DetectionConfig,
+    ForcesAlongNormals,
     detect_contacts,
+    prepare,
     with_detected_contacts,
 )
-from torchid.problem.detection_forces import ForcesAlongNormals
-from torchid.problem.detection_motion import prepare
 from torchid.problem.rows import RowBuilder
 from torchid.robot import Robot
 from torchid.sensing import Contact

@@ -14,8 +14,7 @@ from motions import value
 from torchid.logs.preprocess import away_from_changes
 from torchid.parameters import COULOMB, PER_BODY
 from torchid.problem import LinearProblem
-from torchid.problem.detection_forces import fitted_parameters, most_probable
-from torchid.problem.detection_motion import prepare
+from torchid.problem.contact_detection import fitted_parameters, most_probable, prepare
 from torchid.problem.extras import ExtraTerms
 from torchid.problem.rows import RowBuilder
 from torchid.sensing import named_sensors

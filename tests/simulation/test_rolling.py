@@ -19,7 +19,7 @@ from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import resolve_contacts
 from torchid.logs import Log
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
-from torchid.problem.floor_pose import rolled_distance
+from torchid.problem.base_pose import rolled_distance
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
 from torchid.simulation import Stability, set_up_simulation

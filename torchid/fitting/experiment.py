@@ -36,10 +36,9 @@ from torchid.logs.columns import fits, for_all, require_names, values_of_all
 from torchid.logs.ros_topics import Topics, require_joints
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
-from torchid.problem.base_pose import FEET
+from torchid.problem.base_pose import FEET, FEWEST_POINTS, points_of
 from torchid.problem.compression import BY_FOLD, Block, Part, merge
 from torchid.problem.extras import CHANNELS, ScaleGroups, measured_channels
-from torchid.problem.floor_pose import FEWEST_POINTS, points_of
 from torchid.problem.noise import LogOfOtherProcess
 from torchid.reprs import short_repr
 from torchid.robot import CollisionShapes, Robot, RollingShape, load_robot, require_payloads

@@ -26,7 +26,7 @@ from torchid.log_checks.model import LinkPoses, recorded_link_poses, same_poses
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.quaternion import rotate_to_world
-from torchid.problem.floor_pose import rolled_distance
+from torchid.problem.base_pose import rolled_distance
 from torchid.robot import Robot
 from torchid.sensing import Contact
 from torchid.sensing.sensors import join_numbers

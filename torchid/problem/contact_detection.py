@@ -1,35 +1,66 @@
-"""Which contacts stand when, from joint torques and the robot's own dynamics."""
+"""Which contacts stand when, from joint torques and the robot's own dynamics.
+
+A log is filtered (`prepare`), forces of the ground follow from its torques and dynamics (`ForcesAlongNormals`), and
+contacts stand by thresholds on these (`detect_contacts`); parameters that fit the log then make both finer.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
+from scipy.spatial.transform import Rotation
 
+from torchid import distributed
+from torchid.errors import InputError, LogError, TorchidWarning
 from torchid.logs import Log
 from torchid.logs.flags import beside_changes, hysteresis, samples_of, without_short
 from torchid.logs.log import BoolArray, FloatArray
-from torchid.logs.preprocess import find_unloaded
+from torchid.logs.preprocess import find_unloaded, preprocess
+from torchid.logs.timeline import JITTER
+from torchid.parameters import FRICTION, GRAVITY, PER_BODY
+from torchid.problem.base_pose import base_pose_from_feet, levelled
+from torchid.problem.compression import compress_parts
 from torchid.problem.contact_slip import base_velocity, contact_velocities, keep_still
-from torchid.problem.detection_forces import ForcesAlongNormals, fitted_parameters
-from torchid.problem.detection_motion import DetectionSamples, detection_cutoff_hz, nyquist_hz, prepare
-from torchid.problem.samples import require_contacts
+from torchid.problem.elimination import assemble
+from torchid.problem.extras import ExtraTerms
+from torchid.problem.linear import PRIOR_DEVIATION, LinearProblem
+from torchid.problem.log_joints import joint_order
+from torchid.problem.metrics import force_series
+from torchid.problem.motion import BaseMotion, base_motion
+from torchid.problem.rows import RowBuilder
+from torchid.problem.samples import Samples, require_contacts
+from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
-from torchid.sensing import Contact
+from torchid.sensing import Contact, named_sensors
 from torchid.settings import STRICT, NotNegative, Positive
 
 _SUPPORTED = 0.25  # of the weight: what contact forces may leave of it in samples that parameters are fitted to
 _LEAST_FITTED = 100  # samples
 _DEVIATIONS = 3.0  # of what feet seem to carry in the air, to which thresholds go down
 _LOWEST = 0.01  # of the stated thresholds
-_FITS, _LESS = 3, 0.9  # of parameters at most, each of which leaves that share of what feet seem to carry in the air
+_FITS = 3
+_LESS = 0.9  # of parameters at most, each of which leaves that share of what feet seem to carry in the air
+_DAMPING = 1e-3  # of actuators' terms, against the share that samples have of them
+_LARGEST = 1.0, 100.0, 100.0  # armature [kg m^2] and friction [N m, N m s/rad] that nothing determines
+_SIGN_WIDTH = 0.001  # rad/s, of friction's sign where none is stated: what rests has none
+_FITTED = 4000  # samples, at least half of them, from which actuators' terms are worked out
+_TOGETHER = 2048  # samples whose forces are solved for at once
+_JOINT_SHARE = 0.1
+_BASE_SHARE = 1.0  # errors of the URDF and of friction, of the largest torque's rms and the weight
+_LEVER_M = 0.3  # arm of the base's moments for a force of the size of its errors
+_FREE = 10.0  # standard deviation of a contact force that nothing determines, in weights
+_RATE_SHARE = 0.2  # of the sample rate: highest cutoff
+_MAX_GAPS = 0.05  # share of a torque's samples that may be missing, and are interpolated
+_FEWEST_TORQUES = 3  # above a contact, one for each component of a force
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -82,32 +113,15 @@ def with_detected_contacts(
         LogError: as `detect_contacts`; wrenches without the name of a contact.
     """
     active, certain = detect_contacts(log, robot, contacts, settings or DetectionConfig(), sign_width).flags(possible)
-    bare = log.contact_wrench is None and log.contact_force_normal is None and log.contact_normal_world is None
-    names, flags = name_flags(log.source, () if bare else log.contact_names, contacts, active)
-    return dataclasses.replace(log, contact_names=names, contact_active=flags), certain
-
-
-def name_flags(
-    source: str, names: tuple[str, ...], contacts: Sequence[Contact], active: BoolArray
-) -> tuple[tuple[str, ...], BoolArray]:
-    """Names of the contacts of a log and their flags (N, C'), of flags (N, C) of the experiment's contacts.
-
-    Args:
-        source: name of the log.
-        names: of contacts of which it has readings, () without any.
-        contacts: of the experiment.
-        active: their flags.
-
-    Raises:
-        LogError: readings without the name of a contact.
-    """
-    frames = tuple(contact.frame for contact in contacts)
-    if not names:
-        return frames, active
-    require_contacts(source, names, contacts)
-    flags = np.zeros((len(active), len(names)), dtype=bool)
-    flags[:, [names.index(frame) for frame in frames]] = active
-    return names, flags
+    names = frames = tuple(contact.frame for contact in contacts)
+    readings = (log.contact_wrench, log.contact_force_normal, log.contact_normal_world)
+    if log.contact_names and any(x is not None for x in readings):
+        require_contacts(log.source, log.contact_names, contacts)
+        names = log.contact_names
+        flags = active
+        active = np.zeros((len(log), len(names)), dtype=bool)
+        active[:, [names.index(frame) for frame in frames]] = flags
+    return dataclasses.replace(log, contact_names=names, contact_active=active), certain
 
 
 class Detection(NamedTuple):
@@ -152,14 +166,16 @@ def detect_contacts(
         InputError: a cutoff that does not suit the log.
     """
     if not contacts:
-        none, every = np.zeros((len(log), 0), dtype=bool), np.ones(len(log), dtype=bool)
+        none = np.zeros((len(log), 0), dtype=bool)
+        every = np.ones(len(log), dtype=bool)
         return Detection(none, every, none, every)
 
     filtered = partial(prepare, log, robot, contacts)
-    known = filtered(detection_cutoff_hz(settings.cutoff_hz, log.time))
+    known = filtered(min(settings.cutoff_hz, 2.0 * _RATE_SHARE * nyquist_hz(log.time)))
     forces = ForcesAlongNormals.of(known, robot, contacts, sign_width)
     seen = _Seen.of(known, forces, settings)
-    found, time = seen.judged(), seen.time
+    found = seen.judged()
+    time = seen.time
     if settings.refit and seen.accelerates:
         found, time = _detect_again(filtered, forces, seen, found)
     inside = (log.time >= time[0]) & (log.time <= time[-1])
@@ -194,11 +210,11 @@ class _Seen:
     @classmethod
     def of(cls, known: DetectionSamples, forces: ForcesAlongNormals, settings: DetectionConfig) -> _Seen:
         """What the signals say with these forces."""
-        balance, base = forces.balance, base_velocity(known.log, known.samples)
+        base = base_velocity(known.log, known.samples)
         velocity = None
         if known.base_is_known:
-            velocity = contact_velocities(known.samples, balance.robot, balance.contacts, base)
-        return cls(known, forces.of_samples(known) / balance.weight, velocity, base is not None, settings)
+            velocity = contact_velocities(known.samples, forces.robot, forces.contacts, base)
+        return cls(known, forces.of_samples(known) / forces.weight, velocity, base is not None, settings)
 
     @property
     def accelerates(self) -> bool:
@@ -217,13 +233,15 @@ class _Seen:
 
     def judged(self, bounces: bool = False) -> Detection:
         """Which contacts stand; with bounces, no stance is too short to have impacts."""
-        settings, shortest = self.settings, samples_of(self.settings.shortest_s, self.time)
-        loaded = np.stack([hysteresis(one, settings.touch, settings.lift) for one in self.share.T], axis=1)
+        settings = self.settings
+        shortest = samples_of(self.settings.shortest_s, self.time)
+        loaded = np.stack([hysteresis(share, settings.touch, settings.lift) for share in self.share.T], axis=1)
         if self.velocity is not None:
             loaded |= keep_still(self.velocity, self.in_world, loaded, self.share > settings.light, 2 * shortest)
-        flags = np.stack([without_short(one, shortest) for one in loaded.T], axis=1)
-        pulls = np.stack([hysteresis(-one, settings.touch, settings.lift) for one in self.share.T], axis=1)
-        clear, possible = ~beside_changes(loaded if bounces else flags), flags | loaded | pulls
+        flags = np.stack([without_short(share, shortest) for share in loaded.T], axis=1)
+        pulls = np.stack([hysteresis(-share, settings.touch, settings.lift) for share in self.share.T], axis=1)
+        clear = ~beside_changes(loaded if bounces else flags)
+        possible = flags | loaded | pulls
         return Detection(flags, clear & ~(possible & ~flags).any(axis=1), possible, clear)
 
     def noise(self, in_the_air: BoolArray) -> float:
@@ -267,7 +285,8 @@ def _detect_again(
         seen: with these, at the cutoff of the settings.
         found: which contacts stand by these.
     """
-    time, sharp = seen.time, seen.known
+    time = seen.time
+    sharp = seen.known
     lowest: float | None = None
     air, ground = (find_unloaded(time, active, seen.smear_s) for active in (found.active, ~found.active))
     again = _fitted(forces, found.active, found.certain & (air | ground).all(axis=1))
@@ -279,13 +298,14 @@ def _detect_again(
         noise = best.noise(in_the_air)
         if lowest is not None and noise > _LESS * lowest:
             break
-        time, sharp, lowest = best.time, best.known, noise
+        time = best.time
+        sharp = best.known
+        lowest = noise
         is_sharp = sharp.cutoff_hz > seen.known.cutoff_hz
         found = best.finer(in_the_air, is_sharp)
         if not is_sharp or not more:
             break
-        of_robot = forces.balance.robot, forces.balance.contacts, forces.balance.builder.tree.sign_width
-        by_urdf = ForcesAlongNormals.of(sharp, *of_robot)
+        by_urdf = ForcesAlongNormals.of(sharp, forces.robot, forces.contacts, forces.builder.tree.sign_width)
         away = find_unloaded(time, ~found.clear[:, None], 2.0 * best.smear_s)[:, 0]
         again = _fitted(by_urdf, found.possible, away)
     return found, time
@@ -329,9 +349,359 @@ def _fitted(forces: ForcesAlongNormals, active: BoolArray, sure: BoolArray) -> F
         active: which contacts (K, C) stand or may do so.
         sure: samples (K,) in which no other does.
     """
-    kept = np.flatnonzero(sure[forces.chosen] & (forces.unexplained < _SUPPORTED * forces.balance.weight))
+    kept = np.flatnonzero(sure[forces.chosen] & (forces.unexplained < _SUPPORTED * forces.weight))
     if len(kept) < _LEAST_FITTED:
         return None
     flags = torch.from_numpy(active[forces.chosen[kept]])
     samples = dataclasses.replace(forces.samples[torch.from_numpy(kept)], active=flags)
-    return forces.with_parameters(*fitted_parameters(samples, forces.balance.builder, forces.balance.robot))
+    return forces.with_parameters(*fitted_parameters(samples, forces.builder, forces.robot))
+
+
+# ------------------------------------------------------------------------------------------------ filtered signals
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectionSamples:
+    """A log that is filtered for detection.
+
+    Attributes:
+        log: preprocessed, without contacts.
+        samples: bound from it, one for one, in which all contacts stand.
+        rotation: (K, 3, 3) of the base to a world with any heading.
+        cutoff_hz: of the filter, or half the sample rate or more where there is none.
+    """
+
+    log: Log
+    samples: Samples
+    rotation: FloatArray
+    cutoff_hz: float
+
+    @property
+    def base_is_known(self) -> bool:
+        """Whether the base's motion was recorded."""
+        return bool(self.log.imu_frame) or self.log.base_quat_xyzw is not None
+
+    @property
+    def acceleration_is_known(self) -> bool:
+        """Whether the base's linear acceleration was recorded, or follows from what was."""
+        return bool(self.log.imu_frame) or self.log.base_linear_acceleration_world is not None
+
+
+def prepare(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> DetectionSamples:
+    """A log as recorded, with joint torques, prepared for detection.
+
+    A base of which neither pose nor IMU was recorded counts as still, and tilted as if all feet stood.
+
+    Args:
+        log: as recorded; gaps are interpolated.
+        robot: the robot, whose base floats.
+        contacts: that may stand.
+        cutoff_hz: of the filter [Hz]; there is none from half the log's sample rate on.
+
+    Raises:
+        InputError: no torques, fewer than three of joints above a contact, joints that are missing, or as `preprocess`.
+    """
+    if log.joint_torque is None:
+        raise LogError(log.source, "joint_torque", "missing", "the field, from which preprocessing.detect_contacts is")
+    is_filtered = cutoff_hz < (1.0 - JITTER) * nyquist_hz(log.time)
+    with warnings.catch_warnings():  # noise and gaps are warned of where the log is read for its own sake
+        warnings.simplefilter("ignore", TorchidWarning)
+        known = preprocess(_for_detection(log), cutoff_hz if is_filtered else None)
+    order = joint_order(known, robot)
+    position, velocity, acceleration, torque = (
+        torch.from_numpy(np.ascontiguousarray(getattr(known, f"joint_{name}")[:, order]))
+        for name in ("position", "velocity", "acceleration", "torque")
+    )
+    _require_torques(known, robot, contacts, np.isfinite(torque.numpy()).all(axis=0))
+    base, rotation = _base(known, robot, contacts)
+    in_limbs = torque.new_full((len(known), robot.n_dofs - robot.n), torch.nan)
+    samples = Samples(
+        known.source, torch.tensor(known.time), position, velocity, acceleration, base,
+        torch.cat([torque, in_limbs], dim=1), None, False, torch.ones(len(known), len(contacts), dtype=torch.bool),
+    )  # fmt: skip
+    return DetectionSamples(known, samples, rotation, cutoff_hz)
+
+
+def nyquist_hz(time: FloatArray) -> float:
+    """Half the sample rate [Hz] of a log with stamps (N,) [s]."""
+    return 0.5 / float(np.median(np.diff(time))) if len(time) > 1 else 0.5
+
+
+def _require_torques(log: Log, robot: Robot, contacts: Sequence[Contact], measured: BoolArray) -> None:
+    """Refuse a log in which fewer than three joints above a contact have a torque, of which measured are (n,)."""
+    for contact in contacts:
+        above = set[str]()
+        body = robot.links[contact.frame][0]
+        while (joint := robot.bodies[body].joint) is not None:
+            above.add(joint.name if joint.mimic is None else joint.mimic.master)
+            body = joint.parent
+        of_contact = [name for name, known in zip(robot.joint_names, measured, strict=True) if known and name in above]
+        if len(of_contact) < _FEWEST_TORQUES:
+            found = f"measured at {', '.join(of_contact) or 'no joint'} alone above {contact.frame}"
+            accepted = f"torques of {_FEWEST_TORQUES} joints or more above each contact, for detect_contacts"
+            raise LogError(log.source, "joint_torque", found, accepted)
+
+
+def _for_detection(log: Log) -> Log:
+    """The log without contacts and with its gaps interpolated; torques with many are NaN throughout."""
+    fields: dict[str, Any] = {name: None for name in vars(log) if name.startswith(("contact_", "ft_"))}
+    fields |= {"contact_names": (), "ft_names": ()}
+    filled = {
+        name: _filled(np.asarray(array, dtype=np.float64))
+        for name, array in log.arrays().items()
+        if name.startswith(("joint_", "base_", "imu_"))
+    }
+    broken = np.isnan(np.asarray(log.joint_torque)).mean(axis=0) > _MAX_GAPS
+    filled["joint_torque"] = np.where(broken, np.nan, filled["joint_torque"])
+    return dataclasses.replace(log, **fields | filled)
+
+
+def _base(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[BaseMotion, FloatArray]:
+    """Motion of the base, and its rotation (N, 3, 3) to a world with any heading."""
+    zero = np.zeros((len(log), 3))
+    if log.imu_frame:
+        motion = base_motion(log, robot)
+        if log.base_quat_xyzw is not None or motion.specific_force is None:
+            return motion, _rotation(np.asarray(log.base_quat_xyzw))
+        up = motion.specific_force.numpy()
+        rotation = levelled(up / np.maximum(np.linalg.norm(up, axis=1, keepdims=True), np.finfo(float).tiny))
+        quat = torch.from_numpy(Rotation.from_matrix(rotation).as_quat())
+        return dataclasses.replace(motion, quat_xyzw=quat), rotation
+    rates = log.base_angular_velocity_base, log.base_angular_acceleration_base
+    rotation = _if_all_stand(log, robot, contacts) if log.base_quat_xyzw is None else _rotation(log.base_quat_xyzw)
+    moved = log.base_linear_acceleration_world
+    force = np.einsum("nji,nj->ni", rotation, (zero if moved is None else moved) - np.array(GRAVITY_WORLD))
+    quat = Rotation.from_matrix(rotation).as_quat()
+    omega, alpha = (zero if rate is None else rate for rate in rates)
+    return BaseMotion(*map(torch.from_numpy, (quat, force, omega, alpha))), rotation
+
+
+def _rotation(quat: FloatArray) -> FloatArray:
+    return np.asarray(Rotation.from_quat(quat).as_matrix())
+
+
+def _if_all_stand(log: Log, robot: Robot, contacts: Sequence[Contact]) -> FloatArray:
+    """Rotations (N, 3, 3) of the base as if all feet stood, near enough for their load; else its z axis points up."""
+    frames = tuple(contact.frame for contact in contacts)
+    flags = np.ones((len(log), len(contacts)), dtype=bool)
+    bare = Log(log.source, log.time, log.joint_names, log.joint_position, contact_names=frames, contact_active=flags)
+    try:
+        quat = base_pose_from_feet(bare, robot, contacts).log.base_quat_xyzw
+    except InputError:
+        quat = None
+    return np.tile(np.eye(3), (len(log), 1, 1)) if quat is None else _rotation(_filled(quat))
+
+
+def _filled(values: FloatArray) -> FloatArray:
+    """Channels (N, k) with NaN interpolated; one that is NaN throughout stays so."""
+    if not np.isnan(values).any():
+        return values
+    out = values.copy()
+    index = np.arange(len(values))
+    for column in out.T:
+        good = np.isfinite(column)
+        if good.any():
+            column[~good] = np.interp(index[~good], index[good], column[good])
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- forces of the ground
+
+
+@dataclasses.dataclass(frozen=True)
+class ForcesAlongNormals:
+    """Forces along the ground's normal by the URDF's dynamics, with the armature and friction (m, 3) of a log's joints.
+
+    Of all wrenches of all contacts, as if each could carry, those that balance measured joint torques, gravity and
+    inertia best, weighted least squares over the joints' and the base's rows. A base of which neither pose nor IMU was
+    recorded counts as still, and tilted as if all feet stood.
+
+    Attributes:
+        robot: with the parameters by which they are worked out.
+        contacts: read along the axes of their frames.
+        builder: of rows of the measured joints.
+        rows: of the base and the joints whose torques were measured throughout, (6 + n,).
+        error: standard deviations of these rows [N, N m].
+        weight: of the robot [N].
+        actuators: armature, Coulomb and viscous friction.
+        chosen: numbers (M,) of the evenly spaced samples of which these are.
+        samples: those samples, in which all contacts stand.
+        unexplained: (M,) [N], size of the force on the base that contact forces do not make up.
+    """
+
+    robot: Robot
+    contacts: Sequence[Contact]
+    builder: RowBuilder
+    rows: BoolArray
+    error: FloatArray
+    weight: float
+    actuators: FloatArray
+    chosen: NDArray[np.intp]
+    samples: Samples
+    unexplained: FloatArray
+
+    @classmethod
+    def of(
+        cls, known: DetectionSamples, robot: Robot, contacts: Sequence[Contact], sign_width: float | None = None
+    ) -> ForcesAlongNormals:
+        """Of a log, with friction whose sign is so wide [rad/s or m/s]."""
+        torque = known.samples.torque
+        rms = np.full(robot.n, np.nan)
+        if torque is not None:
+            rms = np.sqrt(np.square(torque[:, : robot.n].numpy()).mean(axis=0))
+        measured = np.isfinite(rms)
+        weight = GRAVITY * float(robot.nominal[:, 0].sum())
+        of_joints = _JOINT_SHARE * float(rms[measured].max(initial=0.0)) + 1e-6 * weight
+        of_base = _BASE_SHARE * weight * np.array([1.0, 1.0, 1.0, _LEVER_M, _LEVER_M, _LEVER_M])
+        plain = [dataclasses.replace(contact, along_normal=False) for contact in contacts]
+        sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
+        sensors = dataclasses.replace(sensors, torque=np.append(measured, sensors.torque[robot.n :]))
+        width = _SIGN_WIDTH if sign_width is None else sign_width
+        chosen = np.arange(0, len(known.log), -(-len(known.log) // _FITTED))
+        forces = cls(
+            robot=robot,
+            contacts=plain,
+            builder=RowBuilder(robot, plain, sensors, ExtraTerms(armature=True, sign_width=width)),
+            rows=np.concatenate([np.ones(6, dtype=bool), measured]),
+            error=np.concatenate([of_base, np.full(int(measured.sum()), of_joints)]),
+            weight=weight,
+            actuators=np.zeros((int(measured.sum()), 3)),
+            chosen=chosen,
+            samples=known.samples[torch.from_numpy(chosen)],
+            unexplained=np.zeros(len(chosen)),
+        )
+        balance = forces._equations(forces.samples, known.rotation[chosen])
+        actuators = _fit_actuators(balance)
+        missing = balance.missing_with(actuators)[..., None]
+        unbalanced = (missing - balance.maps @ (balance.solver @ missing))[:, :3, 0] * forces.error[:3]
+        return dataclasses.replace(forces, actuators=actuators, unexplained=np.linalg.norm(unbalanced, axis=1))
+
+    def with_parameters(self, nominal: FloatArray, armature: FloatArray) -> ForcesAlongNormals:
+        """Those of the robot with other parameters (L, 12), and armatures (m,) of joints whose torque was measured."""
+        robot = dataclasses.replace(self.robot, nominal=nominal)
+        return dataclasses.replace(self, robot=robot, actuators=np.outer(armature, [1.0, 0.0, 0.0]))
+
+    def of_samples(self, known: DetectionSamples) -> FloatArray:
+        """Forces (K, C) [N] of all samples of a log."""
+        ends = np.cumsum([len(contact.components) for contact in self.contacts])[:-1]
+        out = np.empty((len(known.log), len(self.contacts)))
+        for start in range(0, len(out), _TOGETHER):
+            part = slice(start, start + _TOGETHER)
+            balance = self._equations(known.samples[part], known.rotation[part])
+            wrenches = (balance.solver @ balance.missing_with(self.actuators)[..., None])[..., 0]
+            by_contact = np.split(wrenches, ends, axis=1)
+            for contact, (wrench, normal) in enumerate(zip(by_contact, balance.normals, strict=True)):
+                out[part, contact] = (wrench[:, :3] * normal).sum(axis=1)
+        return out
+
+    def _equations(self, samples: Samples, rotation: FloatArray) -> _Balance:
+        """Of some samples, with rotations (M, 3, 3) of the base to the world."""
+        n = 6 + self.robot.n
+        _, predicted = force_series(self.builder, samples, self.robot.nominal.flatten()[None])
+        missing = predicted[0, :, :n].copy()
+        missing[:, 6:] -= np.zeros(1) if samples.torque is None else samples.torque[:, : self.robot.n].numpy()
+        J_C = self.builder.contact_jacobian(samples).numpy()
+        maps = []
+        normals = []
+        for number, contact in enumerate(self.contacts):
+            J = J_C[:, number]
+            maps.append(J[:, list(contact.components), :n][:, :, self.rows])
+            in_base = rotation.swapaxes(1, 2) @ np.array(contact.normal)
+            normals.append((J[:, :3, :3] @ in_base[..., None])[..., 0])  # which turns the base's axes into the frame's
+        A = np.asarray(np.concatenate(maps, axis=1).swapaxes(1, 2) / self.error[:, None], dtype=np.float64)
+        free = np.concatenate([_free(contact) for contact in self.contacts]) / (_FREE * self.weight)
+        solver = np.linalg.solve(A.swapaxes(1, 2) @ A + np.diag(free**2), A.swapaxes(1, 2))
+        velocity = samples.joint_velocity
+        acceleration = samples.joint_acceleration
+        of_joints = [acceleration, self.builder.tree.coulomb_sign(velocity), velocity]
+        terms = torch.stack(of_joints, dim=2).numpy()[:, self.rows[6:]]
+        return _Balance(
+            A,
+            missing[:, self.rows] / self.error,
+            np.asarray(solver, dtype=np.float64),
+            terms / self.error[6:, None],
+            normals,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Balance:
+    """Whitened balances of M samples.
+
+    Attributes:
+        maps: of the k components of contact forces to rows, (M, rows, k).
+        missing: what contact forces have to make up, (M, rows).
+        solver: of that to the components, (M, k, rows).
+        terms: acceleration, smoothed sign of the velocity and velocity by joint whose torque was measured, (M, m, 3).
+        normals: of the ground in the frame of each contact, (M, 3).
+    """
+
+    maps: FloatArray
+    missing: FloatArray
+    solver: FloatArray
+    terms: FloatArray
+    normals: list[FloatArray]
+
+    def missing_with(self, actuators: FloatArray) -> FloatArray:
+        """What contact forces have to make up, (M, rows), with armature and friction (m, 3)."""
+        out = self.missing.copy()
+        out[:, 6:] += (self.terms * actuators).sum(axis=2)
+        return out
+
+
+def _fit_actuators(balance: _Balance) -> FloatArray:
+    """Armature, Coulomb and viscous friction (m, 3) by joint, from what no contact force can make up."""
+    joints = balance.terms.shape[1]
+    inside = balance.maps @ balance.solver
+    projector = (np.eye(inside.shape[1]) - inside)[:, 6:]
+    matrix = np.einsum("njk,nja,nkb->jakb", projector[:, :, 6:], balance.terms, balance.terms, optimize=True)
+    vector = -np.einsum("nj,nja->ja", (projector @ balance.missing[..., None])[..., 0], balance.terms)
+    flat = matrix.reshape(3 * joints, 3 * joints) + np.diag(np.tile(np.square(_LARGEST), joints) ** -1.0)
+    size = np.sqrt(np.diag(flat))
+    damped = flat / size / size[:, None] + _DAMPING * np.eye(len(flat))
+    fitted: FloatArray = (np.linalg.solve(damped, vector.reshape(-1) / size) / size).reshape(joints, 3)
+    return np.maximum(fitted, 0.0)
+
+
+def _free(contact: Contact) -> FloatArray:
+    """Units of a contact's components over those of a force [1, 1/m]."""
+    return np.array([1.0 if k < 3 else 1.0 / _LEVER_M for k in contact.components])
+
+
+_PASSES = 3  # over the variance of what the parameters leave, which settles at once
+
+
+def fitted_parameters(samples: Samples, builder: RowBuilder, robot: Robot) -> tuple[FloatArray, FloatArray]:
+    """Parameters (L, 12) of a robot, and armatures (m,) of its joints, neither friction nor armatures below zero.
+
+    Args:
+        samples: with joint torques and the contacts that stand.
+        builder: of rows, whose extra parameters are armatures.
+        robot: for the prior.
+    """
+    with distributed.apart():  # each process has logs of its own
+        assembly = assemble(compress_parts([samples], builder), builder, robot)
+    phi = most_probable(assembly.problem)
+    armature = np.maximum(np.concatenate(assembly.extras_at(phi)), 0.0)
+    phi = phi.reshape(-1, PER_BODY)
+    phi[:, FRICTION] = np.maximum(phi[:, FRICTION], 0.0)
+    return phi, armature
+
+
+def most_probable(problem: LinearProblem) -> FloatArray:
+    """Parameters (P,) that are most probable by data and nominal values, with the noise that the data themselves show.
+
+    The prior is that of `PRIOR_DEVIATION`; MacKay, Bayesian Interpolation, 1992, with the prior's width known.
+    """
+    unit = problem.scale[problem.free] * PRIOR_DEVIATION
+    A = problem.A[:, problem.free] * unit
+    b = problem.b - problem.A @ problem.nominal
+    information = A.T @ A
+    x = np.zeros(len(unit))
+    for _ in range(_PASSES):
+        misfit = A @ x - b
+        variance = problem.oversampling * (misfit @ misfit + problem.residual) / max(problem.rows, 1)
+        x = np.linalg.lstsq(information + variance * np.eye(len(unit)), A.T @ b, rcond=None)[0]
+    out = problem.nominal.copy()
+    out[problem.free] += unit * x
+    return out

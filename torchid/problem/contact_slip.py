@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.ndimage import binary_opening
 from torch import Tensor
 
 from torchid.errors import warn
 from torchid.logs import Log
-from torchid.logs.flags import runs
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes
 from torchid.problem.rows import RowBuilder
@@ -31,7 +32,6 @@ _STENCIL = 3.0  # steps that a derivative looks to each side
 _TOGETHER = 2048  # samples whose velocities are worked out at once
 _STILL = 0.01  # m/s below which a contact always keeps still: what soft ground and filters leave of a stance
 _STILL_MEDIANS = 2.0  # of the speed of contacts that surely stand, which is noise
-_SPEEDS_TOGETHER = 1 << 16  # samples whose speeds are worked out at once
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ class Slip:
     def __str__(self) -> str:
         """How many samples of which contacts slip, "" for none."""
         named = [
-            f"{frame} in {own.sum()} samples (up to {speed[own].max():.2g} m/s, more than {limit:.2g})"
-            for frame, own, speed, limit in zip(self.frames, self.slips.T, self.speed.T, self.limits, strict=True)
-            if own.any()
+            f"{frame} in {slipping.sum()} samples (up to {speed[slipping].max():.2g} m/s, more than {limit:.2g})"
+            for frame, slipping, speed, limit in zip(self.frames, self.slips.T, self.speed.T, self.limits, strict=True)
+            if slipping.any()
         ]
         return ", ".join(named)
 
@@ -99,44 +99,26 @@ def measure_slip(
         cutoff_hz: of the filter, which spreads what happens at a change over its inverse; None for no filter.
         base_is_derived: whether the base's motion follows from the contacts themselves.
     """
-    known = None if base_is_derived else base_velocity(log, samples)
-    away = away_from_own_changes(recorded, samples.time.cpu().numpy(), contacts, cutoff_hz)
-    speed = ground_speeds(samples, robot, contacts, known, away)
-    return judge_speeds(speed, contacts, limit, relative=known is None and not robot.fixed_base)
-
-
-def ground_speeds(
-    samples: Samples, robot: Robot, contacts: Sequence[Contact], base: Tensor | None, away: BoolArray
-) -> FloatArray:
-    """Speeds of the contacts on the ground, (N, C) [m/s], as `Slip` has them.
-
-    Args:
-        samples: of a log, or of a part of one.
-        robot: the robot.
-        contacts: of the samples.
-        base: velocity of the base's origin along its axes, (N, 3) [m/s]; None where it is not known.
-        away: which contacts are away from their own changes, (N, C), from `away_from_own_changes`.
-    """
+    base = None if base_is_derived else base_velocity(log, samples)
+    is_relative = base is None and not robot.fixed_base
+    away = _away_from_own_changes(recorded, samples.time.cpu().numpy(), contacts, cutoff_hz)
     velocity = contact_velocities(samples, robot, contacts, base)
     velocity[~(samples.active.cpu().numpy() & away)] = np.nan
-    if base is None and not robot.fixed_base:
-        velocity = _against_others(velocity)
-    return np.asarray(np.linalg.norm(velocity, axis=2))
-
-
-def judge_speeds(speed: FloatArray, contacts: Sequence[Contact], limit: float | None, relative: bool) -> Slip:
-    """Slip of all samples of a log, from their `ground_speeds` (N, C) [m/s]; `limit` as of `measure_slip`."""
-    limits = np.full(len(contacts), np.inf if limit is None else limit)
+    speed = np.linalg.norm(_against_others(velocity) if is_relative else velocity, axis=2)
     if limit is None:
-        for contact in np.flatnonzero(np.isfinite(speed).any(axis=0)):
-            noise = float(np.nanmedian(speed[:, contact])) / _MEDIAN_SPEED
-            limits[contact] = max(_NOISES * noise, LEAST_LIMIT)
-    return Slip(speed, limits, relative, tuple(contact.frame for contact in contacts))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of contacts without a known speed
+            noise = np.nanmedian(speed, axis=0) / _MEDIAN_SPEED
+        limits = np.where(np.isnan(noise), np.inf, np.maximum(_NOISES * noise, LEAST_LIMIT))
+    else:
+        limits = np.full(len(contacts), limit)
+    return Slip(speed, limits, is_relative, tuple(contact.frame for contact in contacts))
 
 
 def base_velocity(log: Log, samples: Samples) -> Tensor | None:
     """Velocity of the base's origin along its axes, (N, 3) [m/s]; None where it was not recorded."""
-    velocity, quat = log.base_linear_velocity_world, samples.base.quat_xyzw
+    velocity = log.base_linear_velocity_world
+    quat = samples.base.quat_xyzw
     if velocity is None or quat is None:
         return None
     return (rotation_matrix(quat).mT @ torch.as_tensor(velocity).to(quat)[..., None])[..., 0]
@@ -153,7 +135,8 @@ def contact_velocities(samples: Samples, robot: Robot, contacts: Sequence[Contac
     """
     plain = [dataclasses.replace(contact, along_normal=False) for contact in contacts]  # by the axes of their frames
     builder = RowBuilder(robot, plain, named_sensors("full", robot.n, len(contacts), ft=len(robot.ft_names)))
-    tree, out = builder.tree, np.empty((len(samples), len(builder.contacts), 3))
+    tree = builder.tree
+    out = np.empty((len(samples), len(builder.contacts), 3))
     for start in range(0, len(samples), _TOGETHER):
         part = samples[start : start + _TOGETHER]
         kinematics = builder.kinematics(part)
@@ -173,7 +156,7 @@ def contact_velocities(samples: Samples, robot: Robot, contacts: Sequence[Contac
     return out
 
 
-def away_from_own_changes(
+def _away_from_own_changes(
     recorded: Log, time: FloatArray, contacts: Sequence[Contact], cutoff_hz: float | None
 ) -> BoolArray:
     """Which contacts are away from their own changes, as recorded, at stamps (N,) [s] of a preprocessed log, (N, C)."""
@@ -183,8 +166,8 @@ def away_from_own_changes(
         return away
     for index, contact in enumerate(contacts):
         if contact.frame in recorded.contact_names:
-            own = recorded.contact_active[:, [recorded.contact_names.index(contact.frame)]]
-            alone = dataclasses.replace(recorded, contact_active=np.repeat(own, len(recorded.contact_names), axis=1))
+            flags = recorded.contact_active[:, [recorded.contact_names.index(contact.frame)]]
+            alone = dataclasses.replace(recorded, contact_active=np.repeat(flags, len(recorded.contact_names), axis=1))
             away[:, index] = ~near_contact_changes(alone, time, margin)
     return away
 
@@ -204,7 +187,8 @@ def _against_others(velocity: FloatArray) -> FloatArray:
     """Velocities (N, C, 3), NaN where a contact does not stand, against those that stand; NaN of one alone."""
     count = np.isfinite(velocity[:, :, 0]).sum(axis=1)
     out = np.full_like(velocity, np.nan)
-    two, more = count == 2, count > 2
+    two = count == 2
+    more = count > 2
     if more.any():
         out[more] = velocity[more] - np.nanmedian(velocity[more], axis=1, keepdims=True)
     if two.any():
@@ -225,24 +209,12 @@ def keep_still(
         possible: those that may stand, (N, C).
         shortest: samples in a row.
     """
-    speed = np.empty(standing.shape)
-    for start in range(0, len(speed), _SPEEDS_TOGETHER):
-        part = slice(start, start + _SPEEDS_TOGETHER)
-        seen = velocity[part] if in_world else _against_standing(velocity[part], standing[part])
-        speed[part] = np.linalg.norm(seen, axis=2)
+    speed = np.linalg.norm(velocity if in_world else _against_standing(velocity, standing), axis=2)
     noise = speed[standing & np.isfinite(speed)]
     limit = max(_STILL, _STILL_MEDIANS * float(np.median(noise))) if len(noise) else _STILL
     with np.errstate(invalid="ignore"):
         still = (speed < limit) & possible
-    return np.stack([_lasting(one, shortest) for one in still.T], axis=1)
-
-
-def _lasting(flags: BoolArray, shortest: int) -> BoolArray:
-    """The flags (N,) without runs of fewer true ones."""
-    out = np.zeros_like(flags)
-    for start, stop in runs(flags):
-        out[start:stop] = stop - start >= shortest
-    return out
+    return np.asarray(binary_opening(still, np.ones((max(shortest, 1), 1), dtype=bool)))
 
 
 def _against_standing(velocity: FloatArray, standing: BoolArray) -> FloatArray:
@@ -251,6 +223,6 @@ def _against_standing(velocity: FloatArray, standing: BoolArray) -> FloatArray:
     for contact in range(velocity.shape[1]):
         others = np.where(standing[:, :, None], velocity, np.nan)
         others[:, contact] = np.nan
-        some = np.isfinite(others[:, :, 0]).any(axis=1)
-        out[some, contact] = velocity[some, contact] - np.nanmedian(others[some], axis=1)
+        known = np.isfinite(others[:, :, 0]).any(axis=1)
+        out[known, contact] = velocity[known, contact] - np.nanmedian(others[known], axis=1)
     return out

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchid.errors import LogError, warn
@@ -84,10 +85,10 @@ def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator
             yield UnloadedOffsetEquation(number, scales.get(extra.contact), False, mean, deviation)
 
 
-def _are_masked(count: int, above: int, below: int) -> bool:
+def _are_masked(count: ArrayLike, above: ArrayLike, below: ArrayLike) -> NDArray[np.bool_]:
     """Whether readings in the air are masked or clamped, not measured: many are exactly 0, and few of one sign."""
-    zero = count - above - below
-    return zero > _MASKED_SHARE * count and min(above, below) < _ONE_SIDED * count
+    zero = np.subtract(np.subtract(count, above), below)
+    return (zero > np.multiply(_MASKED_SHARE, count)) & (np.minimum(above, below) < np.multiply(_ONE_SIDED, count))
 
 
 def _robust_mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, float]:
@@ -132,22 +133,19 @@ def zero_in_air(log: Log, contacts: Sequence[Contact]) -> Log:
     along = np.zeros((len(log), count)) if scalar is None else scalar
     readings = np.concatenate([six, along[..., None]], axis=2)
     reads = np.nan_to_num(readings).any(axis=0)  # others are such as moments of points
-    in_the_air = np.zeros(readings.shape[:2], dtype=bool)
-    if log.contact_active is not None:
+    if log.contact_active is None:
+        in_the_air = np.zeros(readings.shape[:2], dtype=bool)
+    else:
         in_the_air = find_unloaded(log.time, log.contact_active)
-    offsets, masked = np.zeros((count, 7)), list[str]()
-    for contact in contacts:
-        if contact.frame not in log.contact_names:
-            continue
-        column = log.contact_names.index(contact.frame)
-        for component in np.flatnonzero(reads[column]):
-            values = readings[in_the_air[:, column], column, component]
-            values = values[np.isfinite(values)]
-            _require_readings(log, contact.frame, int(component), len(values))
-            offsets[column, component] = values.sum() / len(values)
-            is_masked = _are_masked(len(values), int((values > 0.0).sum()), int((values < 0.0).sum()))
-            if is_masked and contact.frame not in masked:
-                masked.append(contact.frame)
+    known = in_the_air[..., None] & np.isfinite(readings)
+    counts = known.sum(axis=0)
+    is_zeroed = reads & np.isin(log.contact_names, [contact.frame for contact in contacts])[:, None]
+    for column, component in np.argwhere(is_zeroed):
+        _require_readings(log, log.contact_names[column], int(component), int(counts[column, component]))
+    values = np.where(known & is_zeroed, readings, 0.0)
+    offsets = values.sum(axis=0) / np.maximum(counts, 1)
+    is_masked = is_zeroed & _are_masked(counts, (values > 0.0).sum(axis=0), (values < 0.0).sum(axis=0))
+    masked = [name for name, channels in zip(log.contact_names, is_masked, strict=True) if channels.any()]
     _warn_of_offsets(log, offsets, masked)
     zeroed: dict[str, Any] = {} if wrench is None else {log.contact_wrench_field: wrench - offsets[:, :6]}
     if scalar is not None:

@@ -16,7 +16,7 @@ from torchid.errors import InputError, LogError, UnknownNameError
 from torchid.logs import Log
 from torchid.logs.log import BoolArray
 from torchid.parameters import Array
-from torchid.problem.floor_pose import rolled_distance
+from torchid.problem.base_pose import rolled_distance
 from torchid.sensing.sensors import NORMAL_INDEX
 from torchid.simulation.plant import Foot, FootMotion, Plant, find_feet, form_polygon, rotation_error
 
