@@ -121,7 +121,7 @@ def measure_stages(builder: RowBuilder, samples: Samples, limits: Limits) -> Sta
                 layout = builder.layout(state)
                 if layout.contact_bodies:
                     contact = builder.contact_rows(layout, known)
-                    exhaust(builder.whitened_bases(layout, contact, contact.of_measured(), known))
+                    exhaust(builder.whitened_bases(layout, contact, known))
 
         def rows() -> None:
             for chunk, state in chunks:
@@ -153,7 +153,7 @@ def needs(builder: RowBuilder, chunks: Sequence[Chunk]) -> tuple[Need, Need, Nee
     for chunk, state in chunks:
         plan, count = builder.layout(state), len(chunk)
         m = tree.base_rows + len(plan.coupled_joints)
-        k = sum(len(part.rows) for body in plan.contact_bodies for part in body.unmeasured)
+        k = sum(body.count for body in plan.contact_bodies)
         r = m - k
         kinematics.add(
             count * (_POSE * tree.n_nodes + _COLUMN * layout.count),

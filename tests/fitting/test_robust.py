@@ -24,7 +24,7 @@ from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import TUNING, Reweighting, RobustLoss, RobustSummary, fit_robustly
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
 from torchid.problem.compression import Part
-from torchid.problem.rows import ChunkDynamics, Workspace
+from torchid.problem.rows import Chunk, Workspace
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise, named_sensors
 
@@ -119,13 +119,13 @@ class Bench:
 class StillRows(RowBuilder):
     """A builder for logs of one motion, the dynamics of whose chunks are worked out once."""
 
-    kept: ClassVar[dict[tuple[float, int], ChunkDynamics]] = {}
+    kept: ClassVar[dict[tuple[float, int], Chunk]] = {}
 
-    def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
+    def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> Chunk:
         key = float(samples.time[0]), len(samples)
         if key not in self.kept:
             self.kept[key] = super().dynamics(samples)
-        return self.kept[key]
+        return replace(self.kept[key], samples=samples)
 
 
 @pytest.fixture(scope="module")

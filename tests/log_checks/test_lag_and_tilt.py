@@ -25,7 +25,7 @@ from torchid.logs import Log, write_log
 from torchid.logs.preprocess import preprocess
 from torchid.logs.segments import with_delayed, with_delayed_torques
 from torchid.problem import bind_log
-from torchid.problem.motion import is_at_rest
+from torchid.problem.samples import is_at_rest
 
 VECTORS = ("base_position_world", "base_linear_velocity_world", "base_linear_acceleration_world")
 

@@ -45,7 +45,7 @@ def at_the_feet(log: Log) -> Array:
     builder = RowBuilder(robot, contacts, named_sensors("full", robot.n, 2))
     with torch.no_grad():
         kinematics = builder.kinematics(samples)
-        wrenches = [builder.recorded_wrench(samples, k, kinematics).numpy() for k in range(2)]
+        wrenches = [builder.recorded_wrench(kinematics, k).numpy() for k in range(2)]
     return np.where(samples.active.numpy()[..., None], np.stack(wrenches, axis=1), 0.0)
 
 

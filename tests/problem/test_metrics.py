@@ -41,10 +41,8 @@ def test_errors_by_group_are_those_of_the_series(tmp_path: Path, fixed_base: boo
     torque = np.hstack([np.zeros((24, base)), value(samples.torque).numpy()])
     limbs, limbs_measured = (x[:, robot.nv :].reshape(24, -1, 2, 3) for x in (off, measured))
     for k, group in enumerate(("ft_force", "ft_moment")):
-        assert found.limb_rms[group] == pytest.approx(rms(limbs[:, :, k]), rel=1e-12)
-        assert found.limb_relative[group] == pytest.approx(
-            rms(limbs[:, :, k]) / rms(limbs_measured[:, :, k]), rel=1e-12
-        )
+        assert found.rms[group] == pytest.approx(rms(limbs[:, :, k]), rel=1e-12)
+        assert found.relative[group] == pytest.approx(rms(limbs[:, :, k]) / rms(limbs_measured[:, :, k]), rel=1e-12)
     expected = {"joint_torque": (np.mean([rms(x) for x in off[:, joints].T]), 1e-12)}
     if base:
         expected |= {"base_force": (rms(off[:, :3]), 1e-12), "base_moment": (rms(off[:, 3:6]), 1e-12)}
@@ -61,13 +59,14 @@ def test_errors_by_group_are_those_of_the_series(tmp_path: Path, fixed_base: boo
     vectors = {group: (limbs[:, :, k], limbs_measured[:, :, k]) for k, group in enumerate(("ft_force", "ft_moment"))}
     if base:
         vectors |= {"base_force": (off[:, :3], measured[:, :3]), "base_moment": (off[:, 3:6], measured[:, 3:6])}
-    assert found.by_axis_rms.keys() == found.by_axis_relative.keys() == vectors.keys()
+    axes = [name for name in found.part_rms if not name.startswith("joint_torque.")]
+    assert sorted(axes) == sorted(f"{group}.{axis}" for group in vectors for axis in "xyz")
     for group, (error, size) in vectors.items():
         for axis, name in enumerate("xyz"):
-            assert found.by_axis_rms[group][name] == pytest.approx(rms(error[..., axis]), rel=1e-12)
+            assert found.part_rms[f"{group}.{name}"] == pytest.approx(rms(error[..., axis]), rel=1e-12)
             share = rms(error[..., axis]) / rms(size[..., axis])
-            assert found.by_axis_relative[group][name] == pytest.approx(share, rel=1e-12)
-            assert found.as_dict()[f"{group}_rms_by_axis"] == found.by_axis_rms[group]
+            assert found.part_relative[f"{group}.{name}"] == pytest.approx(share, rel=1e-12)
+            assert found.as_dict()[f"{group}_rms_by_axis"][name] == found.part_rms[f"{group}.{name}"]
     if base:
         about_mean = rms(measured[:, :3] - measured[:, :3].mean(axis=0))
         assert found.base_force_of_variation == pytest.approx(rms(off[:, :3]) / about_mean, rel=1e-12)

@@ -18,7 +18,8 @@ from torchid.errors import TorchidWarning
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import Samples, bind_log
-from torchid.problem.motion import MIN_MOTION, MIN_TURN_DEG, MotionNoise, is_at_rest
+from torchid.problem.motion import MIN_MOTION, MIN_TURN_DEG, MotionNoise
+from torchid.problem.samples import is_at_rest
 from torchid.robot import Robot
 
 RATE, COUNT = 500.0, 20_000
@@ -83,7 +84,7 @@ def test_samples_with_more_noise_are_off_as_much_as_those_of_noisy_logs(kind: st
     assert noise.turns_force is (kind == "pose")
     size = torch.ones(len(clean), 1, dtype=torch.float64)
     found, expected = (
-        (off.T @ off / len(off)).numpy() for off in (apart(noise.perturbed(clean, size), clean), apart(noisy, clean))
+        (off.T @ off / len(off)).numpy() for off in (apart(clean.perturbed(noise, size), clean), apart(noisy, clean))
     )
     deviation = np.sqrt(np.diag(expected))
     assert (deviation > 0.0).all()
@@ -98,14 +99,14 @@ def test_pairs_are_opposite_and_a_piece_gets_what_the_whole_gets(robot: Robot) -
     noise = samples.motion_noise
     assert noise is not None
     size = torch.ones(len(samples), 1, dtype=torch.float64)
-    up, down = noise.perturbed(samples, size), noise.perturbed(samples, -size)
+    up, down = samples.perturbed(noise, size), samples.perturbed(noise, -size)
     for name in FIELDS:
         a, b, middle = (getattr(x, name) for x in (up, down, samples))
         assert torch.allclose(a + b, 2.0 * middle, rtol=0.0, atol=1e-9)
-    piece = noise.perturbed(samples[100:200], size[100:200])
+    piece = samples[100:200].perturbed(noise, size[100:200])
     assert torch.equal(piece.joint_acceleration, up.joint_acceleration[100:200])
     assert torch.equal(piece.base.specific_force, up.base.specific_force[100:200])
-    assert torch.equal(noise.perturbed(samples, 0.0 * size).joint_position, samples.joint_position)
+    assert torch.equal(samples.perturbed(noise, 0.0 * size).joint_position, samples.joint_position)
 
 
 def test_an_orientation_that_is_off_turns_what_came_from_the_world_and_no_reading_of_an_imu(robot: Robot) -> None:
@@ -116,7 +117,7 @@ def test_an_orientation_that_is_off_turns_what_came_from_the_world_and_no_readin
     for kind in ("pose", "imu"):
         samples = bound(kind, 0.0, robot)[:200]
         noise = MotionNoise(torch.zeros(robot.n, 3, 3, dtype=torch.float64), base, turns_force=kind == "pose")
-        found = noise.perturbed(samples, size[:200])
+        found = samples.perturbed(noise, size[:200])
         before, after = (Rotation.from_quat(x.base.quat_xyzw) for x in (samples, found))
         np.testing.assert_allclose(np.abs((before.inv() * after).as_rotvec()), angle, rtol=0.0, atol=angle**3)
         force, moved = samples.base.specific_force.numpy(), found.base.specific_force.numpy()
@@ -149,9 +150,9 @@ def test_a_robot_is_at_rest_unless_a_joint_travels_or_its_base_turns_or_is_shake
 
 
 def test_sides_look_random(robot: Robot) -> None:
-    from torchid.problem.motion import _sides
+    from torchid.problem.motion import random_sides
 
-    sides = _sides(torch.from_numpy(TIME), 200)
+    sides = random_sides(torch.from_numpy(TIME), 200)
     assert set(sides.unique().tolist()) == {-1.0, 1.0}
     correlation = (sides.T @ sides / len(sides)).numpy()
     assert np.abs(correlation - np.eye(200)).max() < 6.0 / np.sqrt(COUNT)
@@ -170,6 +171,6 @@ def test_a_bolted_base_has_noise_of_joints_alone(robot: Robot, tmp_path: Path) -
     noise = samples.motion_noise
     assert noise is not None
     assert not noise.base.any()
-    perturbed = noise.perturbed(samples, torch.ones(len(samples), 1, dtype=torch.float64))
+    perturbed = samples.perturbed(noise, torch.ones(len(samples), 1, dtype=torch.float64))
     off = (perturbed.joint_position - samples.joint_position).std(0).numpy()
     assert off[0] / off[1] == pytest.approx(0.25, rel=0.1), "in the robot's order"

@@ -80,7 +80,7 @@ def draws(samples: Samples, count: int) -> Iterator[Samples]:
         z = torch.randn(len(samples), 18, generator=generator, dtype=torch.float64)
         q, v, a = torch.einsum("jkl,bjl->kbj", noise.joints, z[:, :6].unflatten(1, (2, 3)))
         base = z[:, 6:] @ noise.base.T
-        perturbed = noise.perturbed(samples, torch.zeros(len(samples), 1, dtype=torch.float64))
+        perturbed = samples.perturbed(noise, torch.zeros(len(samples), 1, dtype=torch.float64))
         moved = perturbed.base
         if moved.specific_force is not None:
             turn = torch.linalg.cross(base[:, :3], samples.base.specific_force)

@@ -10,7 +10,7 @@ from random_samples import random_samples, sensor_set
 
 import torchid
 from torchid.problem import RowBuilder, TriangularFactor
-from torchid.problem.row_blocks import triangularize_base_rows
+from torchid.problem.null_bases import triangularize_base_rows
 
 ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]

@@ -49,7 +49,7 @@ def combined_columns_of_short_chunks(request: pytest.FixtureRequest, monkeypatch
         pytest.importorskip("numba", reason="compiled kernels need Numba, of the extra [fast]")
         from torchid.kernels.gram import write_gram
 
-        monkeypatch.setattr(RowCompressor, "__init__", partialmethod(RowCompressor.__init__, write_gram))
+        monkeypatch.setattr(RowCompressor, "__init__", partialmethod(RowCompressor.__init__, write_gram=write_gram))
     monkeypatch.setattr(module, "_LEAST_ROWS", 0)
     monkeypatch.setattr(module, "_MOST_COMBINED", 1.0)
 
@@ -63,11 +63,11 @@ def with_room(rows: Array) -> Tensor:
 
 def compressed(chunks: list[Array]) -> TriangularFactor:
     """The factor of chunks of rows (M, COLUMNS + 1)."""
-    factor, compressor = TriangularFactor(COLUMNS), RowCompressor()
+    compressor = RowCompressor(TriangularFactor(COLUMNS))
     for rows in chunks:
-        compressor.add(factor, tuple(range(COLUMNS)), with_room(rows))
+        compressor.add(tuple(range(COLUMNS)), with_room(rows))
     compressor.finish()
-    return factor
+    return compressor.factor
 
 
 def exact_rows(kind: Callable[[np.random.Generator, int], Array], chunks: int, noise: float = 0.0) -> list[Array]:
@@ -138,14 +138,3 @@ def test_numbers_that_are_not_finite_reach_the_factor(number: float, chunk: int)
     chunks = exact_rows(well_conditioned, 4)
     chunks[chunk][17, 4] = number
     assert not compressed(chunks).triangle().isfinite().all()
-
-
-def test_a_factor_is_the_same_to_the_last_bit_whatever_was_compressed_before() -> None:
-    """Processes that share a log then find what one finds."""
-    alone, own = compressed(exact_rows(nearly_dependent, 2)), RowCompressor()
-    before, factor = TriangularFactor(COLUMNS), TriangularFactor(COLUMNS)
-    for target, kind in ((before, well_conditioned), (factor, nearly_dependent)):
-        for rows in exact_rows(kind, 2):
-            own.add(target, tuple(range(COLUMNS)), with_room(rows))
-    own.finish()
-    assert torch.equal(factor.triangle(), alone.triangle())

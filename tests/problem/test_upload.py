@@ -12,7 +12,7 @@ from random_samples import random_samples
 from synthetic import SOLO12, load
 
 from torchid.problem import Samples
-from torchid.problem.chunks import CHUNK, _one_ahead, chunk_size, upload
+from torchid.problem.chunks import CHUNK, chunk_size, one_ahead, upload
 from torchid.sensing import Contact
 
 CPU, CUDA, META = torch.device("cpu"), torch.device("cuda"), torch.device("meta")
@@ -39,36 +39,17 @@ def test_on_a_cpu_chunks_are_handed_over_as_they_are(samples: Samples) -> None:
     assert number == 5
 
 
-class Copies:
-    """Copies that are done when somebody waits for them."""
-
-    def __init__(self, events: list[str]) -> None:
-        self.events = events
-
-    def start(self, samples: Samples) -> object:
-        number = int(samples.time[0] / 0.1 + 0.5)
-        self.events.append(f"start {number}")
-
-        def arrived() -> Samples:
-            self.events.append(f"wait {number}")
-            return samples
-
-        return arrived
-
-
-def test_the_next_chunk_and_no_other_is_made_and_copied_while_one_is_worked_on(samples: Samples) -> None:
+def test_the_next_chunk_and_no_other_is_made_while_one_is_worked_on(samples: Samples) -> None:
     events: list[str] = []
-    for chunk, number in _one_ahead(chunks_of(samples, events), Copies(events)):
+    for chunk, number in one_ahead(chunks_of(samples, events)):
         assert torch.equal(chunk.time, samples.time[10 * number : 10 * number + 10])
         until = time.monotonic() + 60.0
-        while number < 5 and f"start {number + 1}" not in events:
+        while number < 5 and f"cut {number + 1}" not in events:
             assert time.monotonic() < until, "the next chunk waits for the work on this one"
             time.sleep(0.001)
         assert f"cut {number + 2}" not in events
         events.append(f"work {number}")
     assert [event for event in events if "work" in event] == [f"work {number}" for number in range(6)]
-    for number in range(6):
-        assert events.index(f"cut {number}") < events.index(f"start {number}") < events.index(f"wait {number}")
 
 
 def test_a_gpu_gets_larger_chunks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -307,8 +307,9 @@ def test_errors_of_a_sensor_in_a_limb_are_shown_and_need_attention_where_they_ex
 ) -> None:
     def with_limb(share: float) -> str:
         pair, limb = consistent.metrics["test"], {"ft_force": 100.0 * share}
-        found = replace(pair.identified, limb_rms=limb, limb_relative={"ft_force": share})
-        nominal = replace(pair.nominal, limb_rms={"ft_force": 230.0})
+        relative = pair.identified.relative | {"ft_force": share}
+        found = replace(pair.identified, rms=pair.identified.rms | limb, relative=relative)
+        nominal = replace(pair.nominal, rms=pair.nominal.rms | {"ft_force": 230.0})
         one = pair._replace(identified=found, nominal=nominal)
         return text(replace(consistent, metrics={**consistent.metrics, "test": one}), 400)
 

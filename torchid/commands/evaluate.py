@@ -40,7 +40,7 @@ from torchid.problem.metrics import (
     pressure_series,
     projected_forces,
 )
-from torchid.problem.motion import is_at_rest
+from torchid.problem.samples import is_at_rest
 from torchid.reading.log_reader import LogReader
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import error_figure

@@ -55,7 +55,7 @@ from torchid.problem.compression import (
 )
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import LOG_SETS
-from torchid.problem.motion import is_at_rest
+from torchid.problem.samples import is_at_rest
 from torchid.reading.log_reader import LogReader, check_read
 from torchid.report.tables import progress_bars
 

@@ -47,7 +47,6 @@ from torchid.problem import (
     Metrics,
     MiniBatches,
     Samples,
-    TriangularFactor,
     assemble,
     compress_parts,
 )
@@ -351,9 +350,7 @@ def sampled_rows(fitter: LogFitter, parts: Sequence[Part]) -> Assembly:
     plain = []
     for part in parts:
         if not part.unloaded:
-            factor = part.factor
-            bare = TriangularFactor.from_blocks(factor.columns, factor.rows, factor.independent_rows, factor.blocks)
-            plain.append(replace(part, factor=bare))
+            plain.append(replace(part, factor=replace(part.factor, noise_gram={})))
     assembly = assemble(plain, fitter.builder, fitter.robot, fitter.friction)
     frozen = np.zeros(assembly.problem.free.shape, dtype=bool) if fitter.frozen is None else fitter.frozen
     return replace(assembly, problem=replace(assembly.problem, free=assembly.problem.free & ~frozen))

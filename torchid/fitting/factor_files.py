@@ -282,7 +282,7 @@ class _PartReader:
         if len(blocks) != len(one.blocks) or len(halves) != len(one.noise_gram):
             raise ValueError("the same columns twice")
         noise_gram = {support: half + half.triu(1).T for support, half in halves.items()}
-        factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, blocks, noise_gram)
+        factor = TriangularFactor(self._columns, one.rows, one.independent_rows, blocks, noise_gram)
         state = tuple(digit == "1" for digit in one.state)
         return Part(self._source, state, factor, one.samples, unloaded=unloaded, masked=set(one.masked))
 

@@ -709,9 +709,9 @@ class Scorer:
             parts_of_fold = [part for part in parts if part.fold == fold]
             squares = sum_residuals(self.builder, logs_of_fold, parts_of_fold, calibrations)
             for (measured, error), sums in zip(pairs, squares, strict=True):
-                measured.whitened.add_squares(sums.measured, sums.rows)
-                error.whitened.add_squares(sums.error, sums.rows)
-                measured.whitened_noise.add_squares(sums.noise, sums.rows)
+                measured.forces.add_squares(sums.measured, sums.rows)
+                error.forces.add_squares(sums.error, sums.rows)
+                measured.noise.add_squares(sums.noise, sums.rows)
         return [self.evaluation.summarize(*pair) for pair in pairs]
 
     def score_training(

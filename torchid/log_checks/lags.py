@@ -333,7 +333,9 @@ class _Sources:
         place = [contact.frame for contact in model.contacts].index(source)
         rates = replace(part, wrench=torch.nan_to_num(slopes.wrench * part.active[..., None]))
         kinematics, J = builder.kinematics(part), builder.contact_jacobian(part)[:, place]
-        return np.asarray(torch.einsum("nwv,nw->nv", J, builder.recorded_wrench(rates, place, kinematics)).numpy())
+        return np.asarray(
+            torch.einsum("nwv,nw->nv", J, builder.recorded_wrench(replace(kinematics, samples=rates), place)).numpy()
+        )
 
 
 def _slopes(log: Log, names: Sequence[str]) -> dict[str, Any]:
@@ -468,7 +470,8 @@ def fit_contact_sensors(filtered: FilteredLog) -> Deviation | None:
         force_and_moment, axes = read.reshape(*read.shape[:2], 2, 3), torch.eye(3, dtype=read.dtype)
         turned = [torch.cross(axis.expand_as(force_and_moment), force_and_moment, dim=-1) for axis in axes]
         changes = [replace(part, wrench=x.reshape(read.shape)) for x in (read, *turned)]
-        wrenches = [(k, builder.recorded_wrench(x, k, kinematics)) for k in range(len(contacts)) for x in changes]
+        chunks = [replace(kinematics, samples=change) for change in changes]
+        wrenches = [(k, builder.recorded_wrench(chunk, k)) for k in range(len(contacts)) for chunk in chunks]
         return np.stack([torch.einsum("nwv,nw->nv", J[:, k], w).numpy() for k, w in wrenches], axis=2)
 
     return fit_deviation(filtered.rows, columns, _SENSOR_PRIOR_STD)

@@ -331,7 +331,7 @@ def _point_shift_forces(builder: RowBuilder, samples: Samples, measured: np.ndar
         kinematics = builder.kinematics(samples)
         J = builder.contact_jacobian(samples).numpy()
         for k in range(len(measured)):
-            force = builder.recorded_wrench(samples, k, kinematics)[:, :3].numpy()
+            force = builder.recorded_wrench(kinematics, k)[:, :3].numpy()
             force = np.where(samples.active[:, k, None].numpy(), force, 0.0)
             for axis in range(3):
                 out[..., axis] += np.einsum("niv,ni->nv", J[:, k, 3:], np.cross(np.eye(3)[axis], force))

@@ -1,10 +1,9 @@
 """From bound logs to a compressed linear problem.
 
 - a log bound to a robot: `samples`, `log_joints`, `motion`
-- contacts, from forces and motion: `contact_detection`, `detection_motion`, `detection_forces`, `contact_slip`,
-  `unloaded_sensors`; the base's pose from feet: `base_pose`, `floor_pose`
-- rows: `rows`, `contact_state`, `row_blocks`, `extras`; compiled `compiled_rows`; in mini-batches
-  `batches`
+- contacts, from forces and motion: `contact_detection`, `contact_slip`, `unloaded_sensors`; the base's pose from
+  feet: `base_pose`
+- rows: `rows`, `contact_state`, `null_bases`, `extras`; compiled `compiled_rows`; in mini-batches `batches`
 - factors: `chunks`, `compression`, `row_compressor`, `noise_gram`
 - the problem: `linear`, `elimination`, `noise`
 - predictions of its parameters: `metrics`

@@ -121,8 +121,8 @@ class MiniBatches:
             order = torch.randperm(len(self._chunks[chunk]), generator=generator)
             rows = self._rows(chunk)
             for part in order.to(rows.f.device).split(self.batch_size):
-                own = part if size == 1 else part[part % size == rank] // size
-                yield rows[own], len(part)
+                share = part if size == 1 else part[part % size == rank] // size
+                yield rows[share], len(part)
 
     def chunks(self) -> Iterator[Batch]:
         """All samples, chunk by chunk, always in the same order."""
@@ -139,10 +139,10 @@ class MiniBatches:
         for log in self._logs:
             for start in range(0, len(log), _CHUNK):
                 samples = log[start : start + _CHUNK].to(self.builder.device)
-                own = with_payload_columns(self.builder, samples, columns)
+                phi_columns = with_payload_columns(self.builder, samples, columns)
                 yield (
                     samples.coordinates(),
-                    predict_forces(self.builder, self.builder.dynamics(samples), own)[0].T,
+                    predict_forces(self.builder, self.builder.dynamics(samples), phi_columns)[0].T,
                 )
 
     def _generator(self, number: int) -> torch.Generator:
@@ -167,9 +167,9 @@ class MiniBatches:
                 samples = log[index[(index >= start) & (index < end)] - start].to(self.builder.device)
                 for state, where in chunks_by_state(samples, len(index)):
                     chosen = samples[where]
-                    own, before = chosen[(rank - before) % size :: size], before + len(chosen)
-                    if len(own) or not parts:  # of a chunk with fewer samples than processes at least the shapes
-                        parts.append(self._batch(own if len(own) else chosen[:1], state)[: len(own)])
+                    share, before = chosen[(rank - before) % size :: size], before + len(chosen)
+                    if len(share) or not parts:  # of a chunk with fewer samples than processes at least the shapes
+                        parts.append(self._batch(share if len(share) else chosen[:1], state)[: len(share)])
         return Batch(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Batch)))
 
     def _batch(self, samples: Samples, state: ContactState) -> Batch:
@@ -187,19 +187,19 @@ class MiniBatches:
         if self.assembly is None:
             raise ValueError("assembly: found None; accepted: one that eliminates the extra parameters")
         parameter_map, kept = self.builder.columns.parameter_map, len(self.columns)
-        one = np.eye(1, kept + 1, kept)
+        rhs = np.eye(1, kept + 1, kept)
         x = np.pad(np.linalg.pinv(parameter_map), ((0, 0), (0, kept + 1 - len(parameter_map))))
         values: dict[str, Array] = {}
-        for own in sorted(self.assembly.eliminations, key=lambda elimination: elimination.log):  # "" of all logs first
-            if own.log not in ("", source):
+        for elimination in sorted(self.assembly.eliminations, key=lambda x: x.log):  # "" of all logs first
+            if elimination.log not in ("", source):
                 continue
-            if own.log or self.assembly.problem.terms is None:
-                psi = own.inverse @ (own.z[:, None] * one - own.C @ x)
+            if elimination.log or self.assembly.problem.terms is None:
+                psi = elimination.inverse @ (elimination.z[:, None] * rhs - elimination.C @ x)
             else:
-                psi = np.eye(len(own.extras), kept + 1, len(parameter_map))
-            x = x if own.log else np.vstack([x, psi])
-            values |= {extra.label: row for extra, row in zip(own.extras, psi, strict=True)}
+                psi = np.eye(len(elimination.extras), kept + 1, len(parameter_map))
+            x = x if elimination.log else np.vstack([x, psi])
+            values |= {extra.label: row for extra, row in zip(elimination.extras, psi, strict=True)}
         extras = np.array([values[extra.label] for extra in self.builder.extras])
         extras[:, -1] *= -1.0  # of the right-hand side
-        out = np.vstack([np.eye(len(parameter_map), kept + 1), extras, one])
+        out = np.vstack([np.eye(len(parameter_map), kept + 1), extras, rhs])
         return torch.from_numpy(out).to(self.builder.device)

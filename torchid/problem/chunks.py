@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from itertools import chain, pairwise
+from itertools import chain, islice, pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -20,6 +20,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
 
+Item = TypeVar("Item")
 Label = TypeVar("Label")
 Result = TypeVar("Result")
 
@@ -68,13 +69,13 @@ def map_chunks(
     choose_kernels(builder, sum(sizes))
     distributed.require_same(hash(tuple(zip(sizes, (task.state for task in tasks), strict=True))), "logs")
     share = distributed.own_share(sizes)
-    own = tasks[share]
+    tasks_here = tasks[share]
     report = None if progress is None else _ProgressOfAll(progress, sum(sizes), sum(sizes[share]))
 
     def run(part: Iterator[_Chunk]) -> Result:
         return reduce(_pieces(part, builder.device, report))
 
-    results = run_in_workers(own, run, workers)
+    results = run_in_workers(tasks_here, run, workers)
     if report is not None:
         report(0)
     return list(chain.from_iterable(distributed.all_gather(results, "chunks")))
@@ -175,13 +176,13 @@ def are_of_one_log(piece: Samples, other: Samples) -> bool:
     """
     if piece.unloaded is not None or other.unloaded is not None:
         return False
-    own, others = (
+    fields, other_fields = (
         {name: x for name, x in (vars(log) | vars(log.base)).items() if name not in ("base", "fold", "block", "blocks")}
         for log in (piece, other)
     )
     return all(
-        x is others[name] or isinstance(x, torch.Tensor) is isinstance(others[name], torch.Tensor) is True
-        for name, x in own.items()
+        x is other_fields[name] or isinstance(x, torch.Tensor) is isinstance(other_fields[name], torch.Tensor) is True
+        for name, x in fields.items()
     )
 
 
@@ -227,16 +228,16 @@ def chunks_by_state(
     starts, state_of_run = _runs(active)
     lengths = np.diff(starts, append=len(active))
     for number in range(state_of_run.max(initial=-1) + 1):
-        own = state_of_run == number
-        count = -(-int(lengths[own].sum()) // chunk)
+        in_state = state_of_run == number
+        count = -(-int(lengths[in_state].sum()) // chunk)
         if count > 1:
             count = -(-count // workers) * workers
-        if own.all():
+        if in_state.all():
             ends = np.linspace(0, len(active), count + 1).astype(int).tolist()
             pieces: Iterable[slice | torch.Tensor] = (slice(*pair) for pair in pairwise(ends))
         else:
-            pieces = torch.from_numpy(np.flatnonzero(np.repeat(own, lengths))).tensor_split(count)
-        state = tuple(active[starts[np.argmax(own)]].tolist())
+            pieces = torch.from_numpy(np.flatnonzero(np.repeat(in_state, lengths))).tensor_split(count)
+        state = tuple(active[starts[np.argmax(in_state)]].tolist())
         for piece in pieces:
             yield state, piece
 
@@ -291,48 +292,29 @@ def upload(chunks: Iterable[tuple[Samples, Label]], device: torch.device) -> Ite
         chunks: with whatever goes with each.
         device: of the work.
     """
-    if device.type == "cuda":
-        return _one_ahead(chunks, _SideStream(device))
-    return ((samples.to(device), label) for samples, label in chunks)
+    if device.type != "cuda":
+        yield from ((samples.to(device), label) for samples, label in chunks)
+        return
+    stream = torch.cuda.Stream(device)
 
-
-def _one_ahead(chunks: Iterable[tuple[Samples, Label]], copies: _SideStream) -> Iterator[tuple[Samples, Label]]:
-    """The chunks as they arrive; the next one is made, and its copy starts, while one is worked on."""
-    following = iter(chunks)
-
-    def start() -> tuple[Callable[[], Samples], Label] | None:
-        for samples, label in following:
-            return copies.start(samples), label
-        return None
-
-    with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(thread_count(),)) as beside:
-        moving = beside.submit(start)
-        while (chunk := moving.result()) is not None:
-            moving = beside.submit(start)
-            yield chunk[0](), chunk[1]
-
-
-class _SideStream:
-    """Copies to a GPU beside the work on it."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self._stream = torch.cuda.Stream(device)
-
-    def start(self, samples: Samples) -> Callable[[], Samples]:
-        """Start to copy samples; call the result where they are needed.
-
-        The present stream then waits for the copy, and the host for nothing.
-        """
+    def copy(chunk: tuple[Samples, Label]) -> tuple[Samples, Label, torch.cuda.Event]:
+        samples, label = chunk
         locked = samples.pin_memory()
-        with torch.cuda.stream(self._stream):
-            there = locked.to(self._device, non_blocking=True)
-            copied = self._stream.record_event()
+        with torch.cuda.stream(stream):
+            return locked.to(device, non_blocking=True), label, stream.record_event()
 
-        def arrived() -> Samples:
-            working = torch.cuda.current_stream(self._device)
-            working.wait_event(copied)
-            there.keep_for(working)  # else its memory would be taken for a later copy while it is worked on
-            return there
+    for samples, label, copied in one_ahead(map(copy, chunks)):
+        working = torch.cuda.current_stream(device)
+        working.wait_event(copied)
+        samples.keep_for(working)  # else its memory would be taken for a later copy while it is worked on
+        yield samples, label
 
-        return arrived
+
+def one_ahead(items: Iterable[Item]) -> Iterator[Item]:
+    """The items; a thread of its own makes the next one while one is worked on."""
+    following = iter(items)
+    with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(thread_count(),)) as beside:
+        made = beside.submit(list, islice(following, 1))
+        while item := made.result():
+            made = beside.submit(list, islice(following, 1))
+            yield item[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,18 +14,15 @@ from torchid.kernels import limbs, rows, states
 from torchid.kernels.gram import SPAN, write_gram, write_grams
 from torchid.kernels.tiles import TILE
 from torchid.parameters import Array
-from torchid.problem.contact_state import ContactStateLayout
+from torchid.problem.contact_state import ContactStateLayout, RowBlock
 from torchid.problem.extras import dof_extra_column
-from torchid.problem.row_blocks import RowBlock, subtract_payload
+from torchid.problem.null_bases import general_bases
 from torchid.problem.row_compressor import ColumnLevels
-from torchid.problem.rows import BlockRows, ChunkKinematics, Workspace, general_bases
+from torchid.problem.rows import BlockRows, Chunk, RowBuilder, Workspace, subtract_payload
 from torchid.problem.samples import Samples
 from torchid.regressor.kinematics import BodyStates, JointMotion, Motion, joint_motion
 from torchid.regressor.tree import KinematicTree
 from torchid.sensing.limbs import PIVOT, WELL_CONDITIONED
-
-if TYPE_CHECKING:
-    from torchid.problem.rows import RowBuilder
 
 
 @dataclass(frozen=True)
@@ -40,19 +37,20 @@ class _Tiles:
     samples: int
     motion: JointMotion
 
-    def kinematics(self, index: Tensor) -> ChunkKinematics:
-        """Of some samples: what the rows of contacts that are fixed to bodies are made of."""
+    def chunk(self, samples: Samples, index: Tensor) -> Chunk:
+        """Some of the samples: what the rows of contacts that are fixed to bodies are made of."""
         parts = self.states[index // TILE, :, :, index % TILE].permute(2, 1, 0)
         rotation = parts[: states.POSITION].unflatten(0, (3, 3))
         starts = (states.POSITION, states.OMEGA, states.ALPHA, states.FORCE, states.SCREW)
         vectors = (parts[start : start + 3] for start in starts[:-1])
         joints = JointMotion(*(x[:, index] for x in vars(self.motion).values()))
-        return ChunkKinematics(joints, BodyStates(rotation, *vectors), parts[states.SCREW :], None, {}, False, {}, None)
+        screw_axes = parts[states.SCREW :]
+        body_states = BodyStates(rotation, *vectors)
+        return Chunk(samples[index], joints, body_states, screw_axes, None, {}, {}, screw_axes[:, :0])
 
 
-@dataclass(frozen=True)
-class _Limbs:
-    """What `limbs.write_bases` takes of a contact state."""
+class _Limbs(NamedTuple):
+    """What `limbs.write_bases` takes of a contact state, in the order of its arguments."""
 
     limbs: np.ndarray
     wrenches: Array
@@ -63,7 +61,7 @@ class _Limbs:
 
     @classmethod
     def of(cls, tree: KinematicTree, layout: ContactStateLayout) -> _Limbs:
-        own, wrenches, dofs = list[list[int]](), list[Tensor](), list[int]()
+        table, wrenches, dofs = list[list[int]](), list[Tensor](), list[int]()
         moved, ratios = list[tuple[int, int]](), list[float]()
         for body in layout.contact_bodies:
             first, count = len(moved), len(body.joints)
@@ -72,11 +70,12 @@ class _Limbs:
                     if ratio := float(tree.joint_map[node, layout.coupled_joints[joint]]):
                         moved.append((number, node))
                         ratios.append(ratio)
-            own.append([body.body, count, len(dofs), first, len(moved)])
-            wrenches.extend(part.rows for part in body.unmeasured)
+            table.append([body.body, count, len(dofs), first, len(moved)])
+            if body.span is not None:
+                wrenches.append(body.span)
             dofs.extend(body.joints)
         flat = torch.cat(wrenches).flatten().numpy()
-        return cls(np.array(own), flat, np.array(dofs), np.array(moved), np.array(ratios), layout.row_std.numpy())
+        return cls(np.array(table), flat, np.array(dofs), np.array(moved), np.array(ratios), layout.row_std.numpy())
 
 
 @dataclass(frozen=True)
@@ -197,7 +196,7 @@ class CompiledChunk:
         """
         if self.samples.payload is None and not self.builder.extras:
             for group in self.groups:
-                known = [own for block in group.blocks if (own := levels(block.support)) is not None]
+                known = [block_levels for block in group.blocks if (block_levels := levels(block.support)) is not None]
                 if len(known) == len(group.blocks):
                     yield from self._multiplied(group, known)
 
@@ -208,7 +207,7 @@ class CompiledChunk:
         rows.write_rows(*group.arrays(self.workspace), placed, *group.tables.of_bodies, flat.numpy())
         for block, in_W, (_, each, width, start, *_) in zip(group.blocks, group.joints, placed.tolist(), strict=True):
             stacked = flat[start:][: width * (width + each * count)].unflatten(0, (width, -1))
-            made = BlockRows(block, stacked, stacked[:, width:].unflatten(1, (each, count)), None)
+            made = BlockRows(block, stacked, stacked[:, width:].unflatten(1, (each, count)))
             self._complete(made, group.W, in_W)
             yield made
 
@@ -216,9 +215,9 @@ class CompiledChunk:
         tables = group.tables
         placed, size = tables.placed(min(SPAN, group.tiles.samples))
         flat, widths = self.workspace.empty("rows", group.W, size), tables.blocks[:, 2]
-        counts = np.array([len(own.lower) for own in levels])
+        counts = np.array([len(x.lower) for x in levels])
         lower, combination = (
-            np.concatenate([getattr(own, name).ravel() for own in levels]) for name in ("lower", "to_lower")
+            np.concatenate([getattr(x, name).ravel() for x in levels]) for name in ("lower", "to_lower")
         )
         table = np.column_stack([_starts(counts), counts, _starts(counts * widths), _starts(widths**2)])
         squares, grams = np.empty(len(lower)), np.empty(int((widths**2).sum()))
@@ -295,12 +294,12 @@ class CompiledRows:
         out = workspace.empty("joints", joints.position, 6, nodes, padded)
         base = workspace.empty("base", joints.position, 9, padded)
         out[..., samples:], base[:, samples:] = 0.0, 0.0
-        own, angle = out[..., :samples], joints.position * self._builder.tree.revolute
-        torch.cos(angle, out=own[states.COSINE])
-        torch.sin(angle, out=own[states.SINE])
-        torch.mul(joints.position, self._builder.tree.prismatic, out=own[states.SLIDE])
-        own[states.VELOCITY], own[states.ACCELERATION] = joints.velocity, joints.acceleration
-        own[states.DIRECTION] = joints.direction
+        used, angle = out[..., :samples], joints.position * self._builder.tree.revolute
+        torch.cos(angle, out=used[states.COSINE])
+        torch.sin(angle, out=used[states.SINE])
+        torch.mul(joints.position, self._builder.tree.prismatic, out=used[states.SLIDE])
+        used[states.VELOCITY], used[states.ACCELERATION] = joints.velocity, joints.acceleration
+        used[states.DIRECTION] = joints.direction
         of_base = (motion.base_angular_velocity, motion.base_angular_acceleration, motion.base_specific_force)
         torch.cat([x.T for x in of_base], out=base[:, :samples])
         made = workspace.empty("states", base, padded // TILE, nodes, states.STATE, TILE)
@@ -314,10 +313,9 @@ class CompiledRows:
         builder, m = self._builder, len(layout.row_std)
         if not m:
             return tiles.states.new_empty(1, 0, 0, TILE), tiles.states.new_empty(tiles.samples, 0)
-        kinematics = builder.kinematics(samples)
-        contact = builder.contact_rows(layout, kinematics)
-        measured = contact.of_measured()
-        bases = list(builder.whitened_bases(layout, contact, measured, kinematics))
+        chunk = builder.kinematics(samples)
+        contact = builder.contact_rows(layout, chunk)
+        bases = list(builder.whitened_bases(layout, contact, chunk))
         if len(bases) != 1 or bases[0][1].shape[2] != tiles.samples:
             return None
         basis = bases[0][1]
@@ -325,7 +323,7 @@ class CompiledRows:
         padded[..., : tiles.samples], padded[..., tiles.samples :] = basis, 0.0
         W = workspace.empty("W", basis, len(tiles.states), *basis.shape[:2], TILE)
         W.copy_(padded.unflatten(2, (-1, TILE)).permute(2, 0, 1, 3))
-        return W, builder.coupled_forces(samples, layout, measured, kinematics)
+        return W, builder.coupled_forces_with_contacts(layout, contact, chunk)
 
     def _bases_by_kernel(
         self, samples: Samples, layout: ContactStateLayout, tiles: _Tiles, workspace: Workspace
@@ -334,39 +332,32 @@ class CompiledRows:
         key = id(layout)  # which the builder keeps
         if key not in self._limbs:
             self._limbs[key] = _Limbs.of(self._builder.tree, layout)
-        own = self._limbs[key]
+        table = self._limbs[key]
         count, nodes = tiles.states.shape[:2]
-        W = workspace.empty("W", tiles.states, count, len(own.row_std), limbs.BASE, TILE)
+        W = workspace.empty("W", tiles.states, count, len(table.row_std), limbs.BASE, TILE)
         suspect = torch.empty(count * TILE, dtype=torch.bool)
         axes = self._builder.noise_axes(samples.base.rotation, self._builder.sensors.noise)
         along = workspace.empty("axes", tiles.states, 3, 3, count * TILE)
         along[..., : tiles.samples] = torch.eye(3)[..., None] if axes is None else axes.permute(1, 2, 0)
         along[..., tiles.samples :] = 0.0
-        limbs.write_bases(
-            *(_flat(tiles.states), _flat(along), nodes, own.limbs, own.wrenches, own.dofs, own.moved, own.ratios),
-            *(own.row_std, WELL_CONDITIONED**2, PIVOT, _flat(W), suspect.numpy()),
-        )
+        chunk_arrays = _flat(tiles.states), _flat(along), nodes
+        limbs.write_bases(*chunk_arrays, *table, WELL_CONDITIONED**2, PIVOT, _flat(W), suspect.numpy())
         doubtful = torch.nonzero(suspect[: tiles.samples])[:, 0]
         if len(doubtful):
             order = self._builder.tree.index(layout.blocks.order)
-            contact = self._builder.contact_rows(layout, tiles.kinematics(doubtful))
+            contact = self._builder.contact_rows(layout, tiles.chunk(samples, doubtful))
             axes = None if axes is None else axes[doubtful]
-            for index, basis in general_bases(layout, contact, slice(None), contact.of_measured(), axes, order):
+            for index, basis in general_bases(layout, contact, axes, order):
                 if basis.shape[1] != limbs.BASE:
                     return None
                 W[doubtful[index] // TILE, :, :, doubtful[index] % TILE] = basis.permute(2, 0, 1)
-        return W, self._builder.coupled_forces(samples, layout, None, None)
+        return W, self._builder.coupled_forces(samples, layout)
 
 
 def _stands_on_limbs(builder: RowBuilder, layout: ContactStateLayout) -> bool:
     """Whether all contacts are limbs with unmeasured forces that are fixed to bodies."""
-    parts = [part for body in layout.contact_bodies for part in body.unmeasured]
-    return (
-        layout.has_own_limbs
-        and not len(layout.wrench_std)
-        and all(part.line_of_action == (None, None) for part in parts)
-        and sum(len(part.rows) for part in parts) == len(layout.coupled_joints)
-    )
+    spans = [body.span for body in layout.contact_bodies]
+    return layout.has_own_limbs and not layout.measured and all(span is not None for span in spans)
 
 
 def _starts(sizes: np.ndarray) -> np.ndarray:

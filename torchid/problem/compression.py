@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -23,7 +22,7 @@ from torchid.problem.chunks import (
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.noise_gram import NoiseGram, PartKey, estimate_noise_gram
-from torchid.problem.row_compressor import RowCompressor, RowWeighting
+from torchid.problem.row_compressor import RowCompressor, RowWeighting, write_gram
 from torchid.problem.rows import BlockRows, RowBuilder, Workspace
 from torchid.problem.samples import Samples
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
@@ -140,7 +139,9 @@ def _lay_out_folds(
         count: number of folds.
         most: blocks of each log at most.
     """
-    total, preceding, out = sum(lengths), 0, []
+    total = sum(lengths)
+    preceding = 0
+    out = []
     for index, length in enumerate(lengths):
         blocks = max(1, round(count * length / max(total, 1)))
         spans = block_spans(length, blocks if most is None else min(blocks, most[index]))
@@ -165,15 +166,6 @@ def in_blocks(logs: Sequence[Samples], spans: Sequence[Sequence[SampleSpan]]) ->
         of_samples = np.column_stack([np.full_like(numbers, log.fold), numbers])
         out.append(replace(log, blocks=torch.from_numpy(of_samples)))
     return out
-
-
-def _in_about_twenty_blocks(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
-    """The logs in blocks of about equal length, some `BLOCKS` in all; fewer where samples or memory are short."""
-    independent = sum(len(log) / log.oversampling for log in logs)
-    count = min(BLOCKS, int(independent / _LEAST_PER_BLOCK), _most_factors(_count_states(logs), builder))
-    count = distributed.broadcast(count, "blocks")
-    total = max(sum(map(len, logs)), 1)
-    return in_blocks(logs, [block_spans(len(log), max(1, round(count * len(log) / total))) for log in logs])
 
 
 def _count_states(logs: Sequence[Samples]) -> int:
@@ -249,14 +241,20 @@ def compress_in_blocks(
 ) -> list[Part]:
     """As `compress_parts`, but each fold in blocks of successive samples, whose scatter widens standard errors.
 
+    Blocks are about equally long, some `BLOCKS` in all; fewer where samples or memory are short.
+
     Args:
         logs: as `split_into_folds` cuts them.
         builder: of their rows.
         progress: called with the number of samples done.
         weight_rows: as in `compress_parts`.
     """
-    in_blocks_of_folds = _in_about_twenty_blocks(logs, builder)
-    return compress_parts(in_blocks_of_folds, builder, progress=progress, weight_rows=weight_rows)
+    independent = sum(len(log) / log.oversampling for log in logs)
+    count = min(BLOCKS, int(independent / _LEAST_PER_BLOCK), _most_factors(_count_states(logs), builder))
+    count = distributed.broadcast(count, "blocks")
+    total = max(sum(map(len, logs)), 1)
+    spans = [block_spans(len(log), max(1, round(count * len(log) / total))) for log in logs]
+    return compress_parts(in_blocks(logs, spans), builder, progress=progress, weight_rows=weight_rows)
 
 
 def _compress_chunks(
@@ -266,44 +264,47 @@ def _compress_chunks(
     parts: dict[PartKey, Part] = {}
     compressors: dict[PartKey, RowCompressor] = {}  # of the blocks that the last chunk has rows of
     absent: list[tuple[TriangularFactor, Tensor, float]] = []  # rows of zeros, counted where they were made
-    workspace, width = builder.workspaces.take(), builder.width
+    workspace = builder.workspaces.take()
 
     for samples, state in chunks:
         spans = PartKey.spans(samples, state)
-        if spans[0][0] not in compressors:  # no later chunk is of the blocks before
-            _finish(compressors)
-        for key, start, end in spans:
-            part = parts.setdefault(key, Part(samples.source, state, TriangularFactor(width), 0, key.fold, key.block))
-            part.samples += end - start
-            compressors.setdefault(key, _compressor(builder))
-        first = spans[0][0]
-        alone = parts[first].factor if weight_rows is None and len(spans) == 1 else None
-        for rows, index in _rows_to_add(builder, samples, state, workspace, alone, compressors[first]):
+        _begin_blocks(spans, parts, compressors, builder)
+        alone = compressors[spans[0][0]] if weight_rows is None and len(spans) == 1 else None
+        for rows, index in _rows_to_add(builder, samples, state, workspace, alone):
             support = rows.block.support
             if weight_rows is not None:
                 weighted = rows.stacked.T[len(support) + 1 :]
                 weighted *= weight_rows(samples, support, weighted)
             for key, start, end in spans:
-                factor, (from_, to) = parts[key].factor, span_of_samples(index, start, end)
-                compressors[key].add(factor, support, _stacked(rows, from_, to, workspace), samples.oversampling)
+                first, last = span_of_samples(index, start, end)
+                compressors[key].add(support, _stacked(rows, first, last, workspace), samples.oversampling)
                 if rows.absent is not None:
-                    absent.append((factor, rows.absent[:, from_:to].sum(), samples.oversampling))
-    _finish(compressors)
+                    absent.append((parts[key].factor, rows.absent[:, first:last].sum(), samples.oversampling))
+    _begin_blocks([], parts, compressors, builder)
     for factor, count, oversampling in absent:
         factor.count(-int(count), oversampling)
     builder.workspaces.give_back(workspace)
     return list(parts.values())
 
 
-def _finish(compressors: dict[PartKey, RowCompressor]) -> None:
-    """Bring the factors up to date."""
-    for compressor in compressors.values():
-        compressor.finish()
-    compressors.clear()
-
-
-def _compressor(builder: RowBuilder) -> RowCompressor:
-    return RowCompressor() if builder.compiled is None else RowCompressor(builder.compiled.write_gram)
+def _begin_blocks(
+    spans: Sequence[tuple[PartKey, int, int]],
+    parts: dict[PartKey, Part],
+    compressors: dict[PartKey, RowCompressor],
+    builder: RowBuilder,
+) -> None:
+    """Open the blocks that a chunk has samples of; finish those before, which no later chunk has any of."""
+    if not spans or spans[0][0] not in compressors:
+        for compressor in compressors.values():
+            compressor.finish()
+        compressors.clear()
+    for key, start, end in spans:
+        if key not in parts:
+            parts[key] = Part(key.source, key.state, TriangularFactor(builder.width), 0, key.fold, key.block)
+        if key not in compressors:
+            writer = write_gram if builder.compiled is None else builder.compiled.write_gram
+            compressors[key] = RowCompressor(parts[key].factor, writer)
+        parts[key].samples += end - start
 
 
 def _rows_to_add(
@@ -311,23 +312,22 @@ def _rows_to_add(
     samples: Samples,
     state: ContactState,
     workspace: Workspace,
-    factor: TriangularFactor | None,
-    compressor: RowCompressor,
+    compressor: RowCompressor | None,
 ) -> Iterator[tuple[BlockRows, Tensor | slice]]:
-    """The rows of a chunk, but for those whose Gram matrices compiled kernels have added to a factor.
+    """The rows of a chunk, but for those whose Gram matrices compiled kernels have added to a compressor.
 
-    `factor`: that takes all rows of the chunk as they are, and its `compressor`; None if there is none.
+    `compressor`: that takes all rows of the chunk as they are; None if there is none.
     """
-    layout = builder.layout(state, samples.contact_normal is not None)
+    layout = builder.layout_of(samples, state)
     chunk = None if builder.compiled is None else builder.compiled.chunk(samples, layout, workspace)
     if chunk is None:
         return builder.blocks(samples, state, workspace)
-    if factor is None:
+    if compressor is None:
         return chunk.rows()
     added = set[int]()
-    for block, squares, gram in chunk.grams(partial(compressor.levels, factor)):
+    for block, squares, gram in chunk.grams(compressor.levels):
         count = (block.rows.stop - block.rows.start) * len(samples)
-        if compressor.add_gram(factor, block.support, squares, gram, count, samples.oversampling):
+        if compressor.add_gram(block.support, squares, gram, count, samples.oversampling):
             added.add(id(block))
     return chunk.rows(added)
 

@@ -1,11 +1,17 @@
-"""Columns of the rows, and the layout of a contact state: its columns, coupled joints, wrenches and loops' forces."""
+"""Columns of the rows and, for each contact state, their layout: coupled joints, wrenches of contacts, blocks of rows.
+
+Rows `W^T [K | f]` stay those of one problem when W is multiplied by any orthogonal matrix from the right. That freedom
+is used for zeros, as a factorization takes time with the square of the columns: at most three rows combine the moment
+on the base, the next three its force, but not its moment, so that inertias of bodies which no coupled joint moves are
+not in them, and all others combine joints alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from itertools import groupby
 
 import numpy as np
 import torch
@@ -15,263 +21,21 @@ from torch import Tensor
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.extras import Extra
-from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
-from torchid.problem.samples import Samples
-from torchid.regressor.columns import reduced_layout, reduction_matrix
+from torchid.regressor.columns import ColumnLayout, reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import BodyStates
 from torchid.regressor.loops import LoopClosures, LoopGeometry
-from torchid.regressor.regressor import (
-    JointRow,
-    contact_arms,
-    forces_at_base,
-    ground_axes,
-    joint_rows,
-    rolling_arms,
-    wrench_transform,
-    wrenches_at_base,
-)
+from torchid.regressor.regressor import JointRow, joint_rows, rolling_arms, wrench_transform, wrenches_at_base
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import measured_components
 
-if TYPE_CHECKING:
-    from torchid.problem.rows import ChunkKinematics
-
-
-class LineOfAction(NamedTuple):
-    """What of forces on a body changes from sample to sample.
-
-    `rolling`: contact whose `rolling_arms` they have, so that they act where it touches the ground. `ground`: contact
-    whose `ground_axes` they are along, in its frame's origin; their rows are (k, 3), by these axes.
-    """
-
-    rolling: int | None = None
-    ground: int | None = None
-
-
-@dataclass(frozen=True)
-class WrenchRows:
-    """Wrenches, (k, 6), at a body's joint frame, in its axes.
-
-    `line_of_action`: where and along which axes their forces act, if that is not fixed to the body.
-    """
-
-    rows: Tensor
-    line_of_action: LineOfAction
-
-
-def wrenches_at_ground(
-    parts: Sequence[WrenchRows], count: int, kinematics: ChunkKinematics, body: int, origin: Callable[[int], Tensor]
-) -> Tensor:
-    """Wrenches on a body at the base origin in base axes, (6, count, B); of more, a basis of what they span.
-
-    Where they span less at some sample, the basis has directions too many: it costs equations, but lets no
-    unmeasured force in.
-
-    Args:
-        parts: of the rows.
-        count: of the wrenches.
-        kinematics: of B samples.
-        body: that the wrenches act on.
-        origin: of a contact frame in the node's joint frame, (3,) [m].
-    """
-    rows, states = [], kinematics.states
-    for part in parts:
-        rolling, ground = part.line_of_action
-        arms = None if rolling is None else kinematics.arms[rolling]
-        if ground is None:
-            rows.append(wrenches_at_base(states, body, part.rows, arms))
-        else:
-            forces = part.rows @ kinematics.ground_axes[ground]
-            rows.append(forces_at_base(states, body, origin(ground), forces, arms))
-    at_base = rows[0] if len(rows) == 1 else torch.cat(rows, dim=1)
-    if at_base.shape[1] == count:
-        return at_base
-    Vh: Tensor = torch.linalg.svd(at_base.permute(2, 1, 0), full_matrices=False).Vh
-    return Vh[:, :count].permute(2, 1, 0)
-
-
-@dataclass(frozen=True)
-class FramePoses:
-    """Poses of a contact's frame in the world, or in a fixed base of which no pose was recorded.
-
-    `rotation`: (B, 3, 3), frame to world. `origin`: (B, 3) [m]; None for wrenches that are about it already.
-    """
-
-    rotation: Tensor
-    origin: Tensor | None
-
-    @classmethod
-    def of(cls, samples: Samples, kinematics: ChunkKinematics, body: int, axes: Tensor, origin: Tensor) -> FramePoses:
-        """Those of a frame with such axes, (3, 3), and origin, (3,) [m], in the joint frame of a body."""
-        R_world_base, position = kinematics.rotation_world_base, samples.base.position
-        rotation = kinematics.states.rotation[:, :, body].permute(2, 0, 1)
-        arm = None if position is None else kinematics.states.position[:, body].T + rotation @ origin
-        rotation = rotation @ axes
-        if R_world_base is not None:
-            rotation = R_world_base @ rotation
-            arm = None if arm is None else (R_world_base @ arm[..., None])[..., 0]
-        return cls(rotation, None if arm is None or position is None else position + arm)
-
-    def in_frame(self, wrench: Tensor) -> Tensor:
-        """Wrenches as recorded, (B, 6) [N, N m], at the frame's origin along its axes."""
-        force, moment = wrench.unflatten(1, (2, 3)).unbind(1)
-        if self.origin is not None:
-            moment = moment - torch.linalg.cross(self.origin, force)
-        return (self.rotation.mT @ torch.stack([force, moment], dim=2)).mT.flatten(1)
-
-    def of_unit(self, axis: int) -> Tensor:
-        """What a recorded component of 1 is there, (B, 6)."""
-        unit = self.rotation.new_zeros(len(self.rotation), 6)
-        unit[:, axis] = 1.0
-        return self.in_frame(unit)
-
-    def reached(self, axis: int) -> range:
-        """Components there to which a recorded one adds."""
-        first, last = (0, 3) if axis < 3 else (3, 6)
-        return range(first, last if self.origin is None else 6)
-
-
-@dataclass(frozen=True)
-class LoopRows:
-    """What a loop exerts.
-
-    `wrenches`, (k, 6): on its first body, at the node's joint frame, without directions that never do work. `joints`:
-    measured ones on which they do, by their place among the coupled joints; `dofs`: by their number.
-    """
-
-    geometry: LoopGeometry
-    wrenches: Tensor
-    joints: tuple[int, ...]
-    dofs: tuple[int, ...]
-
-    def forces(self, tree: KinematicTree, kinematics: ChunkKinematics) -> Tensor:
-        """Torques of a unit of each on its joints, (k, joints, B)."""
-        at_base = wrenches_at_base(kinematics.states, self.geometry.nodes[0], self.wrenches)
-        return self.geometry.forces(tree, kinematics.screw_axes, at_base, self.dofs)
-
-
-class LoopLayouts:
-    """The loops of a robot; `dofs`: degrees of freedom that some of them depends on."""
-
-    def __init__(self, robot: Robot) -> None:
-        self._closures = LoopClosures(robot) if robot.loops else None
-        self.dofs = frozenset() if self._closures is None else frozenset(self._closures.dofs)
-        self._wrenches: dict[tuple[int, tuple[int, ...]], Array] = {}
-
-    def rows(self, coupled: Sequence[int], like: Tensor) -> Iterator[LoopRows]:
-        """Rows of each loop that does work on a measured joint.
-
-        Args:
-            coupled: measured joints whose rows the projection combines.
-            like: a tensor of the rows' type.
-        """
-        closures = self._closures
-        if closures is None:
-            return
-        for number, loop in enumerate(closures.geometries):
-            own = set(loop.dofs(closures.tree))
-            joints = tuple(index for index, joint in enumerate(coupled) if joint in own)
-            dofs = tuple(coupled[index] for index in joints)
-            if (number, dofs) not in self._wrenches:
-                self._wrenches[number, dofs] = closures.effective_wrenches(number, dofs)
-            if len(wrenches := self._wrenches[number, dofs]):
-                yield LoopRows(loop, torch.tensor(wrenches, dtype=like.dtype, device=like.device), joints, dofs)
-
-
-_DETERMINED = 1e-6  # share of a Jacobian's size: a motor moves the passive joints if no more of its column is left
-
-
-@dataclass(frozen=True)
-class _Group:
-    """Loops that share joints, with their degrees of freedom: those of passive joints, and others."""
-
-    loops: tuple[LoopGeometry, ...]
-    passive: tuple[int, ...]
-    driven: tuple[int, ...]
-
-
-class MotorForces:
-    """Rows of generalized forces as the motors of closed loops feel them.
-
-    With the loops' Jacobian J = [J_a, J_p] by motors and passive joints, a motor's motion moves the passive joints by
-    G = -J_p^+ J_a. Of generalized forces f, what goes through the loops drops out of f_a + G^T f_p: the principle of
-    virtual work. `none`: the robot has no loops, and rows stay as they are.
-    """
-
-    def __init__(self, robot: Robot) -> None:
-        self.none = not robot.loops
-        self._base, self._groups = robot.base_rows, list[_Group]()
-        if self.none:
-            return
-        closures = LoopClosures(robot)
-        dofs = [set(loop.dofs(closures.tree)) for loop in closures.geometries]
-        linked = np.array([[bool(one & other) for other in dofs] for one in dofs])
-        _, label = connected_components(linked, directed=False)
-        for group in range(label.max() + 1):
-            members = np.flatnonzero(label == group).tolist()
-            own = sorted(set[int]().union(*(dofs[k] for k in members)))
-            passive = tuple(dof for dof in own if robot.is_passive[dof])
-            driven = tuple(dof for dof in own if not robot.is_passive[dof])
-            self._groups.append(_Group(tuple(closures.geometries[k] for k in members), passive, driven))
-
-    @property
-    def passive(self) -> tuple[int, ...]:
-        """Joints without a motor in loops."""
-        return tuple(dof for group in self._groups for dof in group.passive)
-
-    def above(self, dofs: Iterable[int]) -> set[int]:
-        """Degrees of freedom with those of all loops that some of them are in, but for passive joints in these."""
-        own, out = set(dofs), set(dofs)
-        for group in self._groups:
-            if own & {*group.passive, *group.driven}:
-                out = (out | set(group.driven)) - set(group.passive)
-        return out
-
-    def of(self, tree: KinematicTree, kinematics: ChunkKinematics, forces: Tensor) -> Tensor:
-        """Generalized forces (..., B, n_rows) with those of motors in loops; NaN at passive joints in them.
-
-        Also NaN where motors do not determine how the passive joints move.
-
-        Args:
-            tree: the robot's constants.
-            kinematics: of the samples.
-            forces: rows as in K.
-        """
-        if self.none:
-            return forces
-        out = forces.clone()
-        for group in self._groups:
-            motion, determined = _passive_motion(tree, kinematics, group)  # (B, p, a), (B, a)
-            driven, passive = (tree.index(self._base + k for k in x) for x in (group.driven, group.passive))
-            through = (forces[..., passive][..., None, :] @ motion)[..., 0, :]
-            out[..., driven] = torch.where(determined, forces[..., driven] + through, torch.nan)
-            out[..., passive] = torch.nan
-        return out
-
-
-def _passive_motion(tree: KinematicTree, kinematics: ChunkKinematics, group: _Group) -> tuple[Tensor, Tensor]:
-    """Motion of passive joints by that of motors, (B, p, a), and which motors (B, a) determine it."""
-    J_p, J_a = (
-        torch.cat([loop.jacobian(tree, kinematics.states, dofs) for loop in group.loops]).permute(2, 0, 1)
-        for dofs in (group.passive, group.driven)
-    )
-    values, p = torch.linalg.svdvals(J_p), len(group.passive)
-    size = torch.linalg.matrix_norm(torch.cat([J_p, J_a], dim=2))[:, None]
-    motion = -torch.linalg.pinv(J_p, rtol=_DETERMINED) @ J_a
-    left = torch.linalg.vector_norm(J_a + J_p @ motion, dim=1)
-    determined = left <= _DETERMINED * size
-    if values.shape[1] < p:  # more passive joints than constraints
-        return motion, torch.zeros_like(determined)
-    return motion, determined & (values[:, p - 1 : p] > _DETERMINED * size if p else determined)
-
-
 ContactState = tuple[bool, ...]
 """Which contacts touch the ground."""
 IN_THE_AIR = "none"
 """Name of the contact state without any."""
+_WRENCH = 6
 
 
 def state_name(contacts: Sequence[Contact], state: ContactState) -> str:
@@ -319,26 +83,354 @@ class RowColumns:
 
 
 @dataclass(frozen=True)
+class LoopRows:
+    """What a loop exerts.
+
+    `wrenches`, (k, 6): on its first body, at the node's joint frame, without directions that never do work. `joints`:
+    measured ones on which they do, by their place among the coupled joints; `dofs`: by their number.
+    """
+
+    geometry: LoopGeometry
+    wrenches: Tensor
+    joints: tuple[int, ...]
+    dofs: tuple[int, ...]
+
+    def forces(self, tree: KinematicTree, states: BodyStates, screw_axes: Tensor) -> Tensor:
+        """Torques of a unit of each on its joints, (k, joints, B)."""
+        at_base = wrenches_at_base(states, self.geometry.nodes[0], self.wrenches)
+        return self.geometry.forces(tree, screw_axes, at_base, self.dofs)
+
+
+_DETERMINED = 1e-6  # share of a Jacobian's size: a motor moves the passive joints if no more of its column is left
+
+
+@dataclass(frozen=True)
+class _LoopGroup:
+    """Loops that share joints, with their degrees of freedom: those of passive joints, and others."""
+
+    loops: tuple[LoopGeometry, ...]
+    passive: tuple[int, ...]
+    driven: tuple[int, ...]
+
+
+class MotorForces:
+    """Rows of generalized forces as the motors of closed loops feel them.
+
+    With the loops' Jacobian J = [J_a, J_p] by motors and passive joints, a motor's motion moves the passive joints by
+    G = -J_p^+ J_a. Of generalized forces f, what goes through the loops drops out of f_a + G^T f_p: the principle of
+    virtual work. `none`: the robot has no loops, and rows stay as they are.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.none = not robot.loops
+        self._base = robot.base_rows
+        self._groups = list[_LoopGroup]()
+        if self.none:
+            return
+        closures = LoopClosures(robot)
+        dofs = [set(loop.dofs(closures.tree)) for loop in closures.geometries]
+        linked = np.array([[bool(dofs_of_loop & other) for other in dofs] for dofs_of_loop in dofs])
+        _, label = connected_components(linked, directed=False)
+        for group in range(label.max() + 1):
+            members = np.flatnonzero(label == group).tolist()
+            members_dofs = sorted(set[int]().union(*(dofs[k] for k in members)))
+            passive = tuple(dof for dof in members_dofs if robot.is_passive[dof])
+            driven = tuple(dof for dof in members_dofs if not robot.is_passive[dof])
+            self._groups.append(_LoopGroup(tuple(closures.geometries[k] for k in members), passive, driven))
+
+    @property
+    def passive(self) -> tuple[int, ...]:
+        """Joints without a motor in loops."""
+        return tuple(dof for group in self._groups for dof in group.passive)
+
+    def above(self, dofs: Iterable[int]) -> set[int]:
+        """Degrees of freedom with those of all loops that some of them are in, but for passive joints in these."""
+        given = set(dofs)
+        out = set(dofs)
+        for group in self._groups:
+            if given & {*group.passive, *group.driven}:
+                out = (out | set(group.driven)) - set(group.passive)
+        return out
+
+    def of(self, tree: KinematicTree, states: BodyStates, forces: Tensor) -> Tensor:
+        """Generalized forces (..., B, n_rows) with those of motors in loops; NaN at passive joints in them.
+
+        Also NaN where motors do not determine how the passive joints move.
+
+        Args:
+            tree: the robot's constants.
+            states: of the joint frames.
+            forces: rows as in K.
+        """
+        if self.none:
+            return forces
+        out = forces.clone()
+        for group in self._groups:
+            motion, determined = _passive_motion(tree, states, group)  # (B, p, a), (B, a)
+            driven, passive = (tree.index(self._base + k for k in x) for x in (group.driven, group.passive))
+            through = (forces[..., passive][..., None, :] @ motion)[..., 0, :]
+            out[..., driven] = torch.where(determined, forces[..., driven] + through, torch.nan)
+            out[..., passive] = torch.nan
+        return out
+
+
+def _passive_motion(tree: KinematicTree, states: BodyStates, group: _LoopGroup) -> tuple[Tensor, Tensor]:
+    """Motion of passive joints by that of motors, (B, p, a), and which motors (B, a) determine it."""
+    J_p, J_a = (
+        torch.cat([loop.jacobian(tree, states, dofs) for loop in group.loops]).permute(2, 0, 1)
+        for dofs in (group.passive, group.driven)
+    )
+    values = torch.linalg.svdvals(J_p)
+    p = len(group.passive)
+    size = torch.linalg.matrix_norm(torch.cat([J_p, J_a], dim=2))[:, None]
+    motion = -torch.linalg.pinv(J_p, rtol=_DETERMINED) @ J_a
+    undetermined = torch.linalg.vector_norm(J_a + J_p @ motion, dim=1)
+    determined = undetermined <= _DETERMINED * size
+    if values.shape[1] < p:  # more passive joints than constraints
+        return motion, torch.zeros_like(determined)
+    return motion, determined & (values[:, p - 1 : p] > _DETERMINED * size if p else determined)
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Consecutive nodes whose wrench columns meet the rows of a block in one product.
+
+    Attributes:
+        nodes: numbers of them.
+        kept: the inertial parameters of each that matter: the first of those that its columns are of.
+        all_kept: those that its columns are of.
+        columns: the columns, among those of all nodes.
+        sources: numbers of the path sums, one for each node, or one for all.
+    """
+
+    nodes: range
+    kept: tuple[int, ...]
+    all_kept: tuple[int, ...]
+    columns: range
+    sources: range
+
+    @property
+    def n_with_force(self) -> int:
+        """Number of the parameters that demand a force; inertias demand moments only."""
+        return sum(column < parameters.INERTIA.start for column in self.kept)
+
+
+@dataclass(frozen=True)
+class RowBlock:
+    """Rows that combine the same degrees of freedom.
+
+    Attributes:
+        rows: which of a sample's.
+        base: base rows that they combine: "all", "force" or "none".
+        moved: nodes that the joints move whose rows they combine, parents first: node, number of the joint, ratio of
+            its motion, and the number of the path sum that the node's adds to, None if it starts from nothing.
+        nodes: on whose inertial parameters they depend.
+        inertial: the columns of these.
+        friction: columns of the joints' friction.
+        extras: columns of extra parameters.
+    """
+
+    rows: slice
+    base: str
+    moved: tuple[tuple[int, int, float, int | None], ...]
+    nodes: tuple[Nodes, ...]
+    inertial: tuple[int, ...]
+    friction: tuple[int, ...]
+    extras: tuple[int, ...]
+
+    @property
+    def support(self) -> tuple[int, ...]:
+        """Columns in which the rows can differ from zero."""
+        return (*self.inertial, *self.friction, *self.extras)
+
+
+class RowBlocks:
+    """The blocks of a contact state's coupled rows.
+
+    `order`: of the degrees of freedom (base rows, then coupled joints), for a W that is triangular: joints from the
+    leaves to the base, then the base's force, then its moment. `has_triangular_base`: whether another W is
+    to be triangular in the base rows (see `torchid.problem.null_bases.triangularize_base_rows`).
+    """
+
+    def __init__(
+        self,
+        columns: RowColumns,
+        coupled: Sequence[int],
+        bodies: Sequence[ContactBody],
+        loop_forces: int,
+        extras: Sequence[tuple[int, Sequence[int], bool]],
+    ) -> None:
+        """Work out what combines with what.
+
+        Args:
+            columns: of the rows.
+            coupled: numbers of the coupled joints.
+            bodies: in contact.
+            loop_forces: number of forces that closed loops exert.
+            extras: extra parameters: column, coupled joints that it depends on, whether it depends on the base.
+        """
+        self._columns = columns
+        self._extras = extras
+        self._held = [body.body for body in bodies if body.is_held]
+        self._unmeasured = sum(body.count for body in bodies) + loop_forces
+        self._moved = sorted(
+            (node, index, ratio)
+            for index, joint in enumerate(coupled)
+            for node, ratio in columns.joint_rows[joint].moved
+        )
+        self._joints = tuple(range(len(coupled)))
+        self._base_rows = columns.tree.base_rows
+        last_node = {joint: node for node, joint, _ in self._moved}
+        leaves_first = sorted(self._joints, key=lambda joint: -last_node[joint])
+        self.order = (*(self._base_rows + joint for joint in leaves_first), *range(self._base_rows))
+        self._triangular = tuple(self._triangular_blocks(leaves_first, [body.joints for body in bodies]))
+        self._by_rank: dict[int, tuple[RowBlock, ...]] = {}
+        self.has_triangular_base = bool(self._base_rows and self._unmeasured)
+
+    def of_rank(self, rank: int) -> tuple[RowBlock, ...]:
+        """The blocks of samples that have so many coupled rows."""
+        if not self._unmeasured:
+            return self._triangular
+        if rank not in self._by_rank:
+            moment = min(3, rank) if self._base_rows else 0
+            force = min(3, rank - moment) if self._base_rows else 0
+            joints = rank - moment - force
+            ends = {"none": joints, "force": joints + force, "all": rank}
+            starts = [0, joints, joints + force]
+            self._by_rank[rank] = tuple(
+                self._block(slice(start, end), self._joints, base)
+                for start, (base, end) in zip(starts, ends.items(), strict=True)
+                if start < end
+            )
+        return self._by_rank[rank]
+
+    def _triangular_blocks(self, leaves_first: Sequence[int], contacts: Sequence[Sequence[int]]) -> Iterator[RowBlock]:
+        """Blocks of limbs that share no joint, and of the base; W combines a joint with those before it in its limb."""
+        linked = np.eye(len(self._joints), dtype=bool)
+        for joints in contacts:
+            linked[np.ix_(joints, joints)] = True
+        limb = connected_components(linked, directed=False)[1]
+        start = 0
+        for number, run in groupby(leaves_first, key=lambda joint: int(limb[joint])):
+            end = start + len(list(run))
+            members = tuple(sorted(joint for joint in leaves_first[:end] if limb[joint] == number))
+            yield self._block(slice(start, end), members, "none")
+            start = end
+        if self._base_rows:
+            yield self._block(slice(start, start + 3), self._joints, "force")
+            yield self._block(slice(start + 3, start + 6), self._joints, "all")
+
+    def _block(self, rows: slice, joints: tuple[int, ...], base: str) -> RowBlock:
+        extras = tuple(
+            column
+            for column, extra_joints, enters_base in self._extras
+            if (enters_base and base != "none") or not set(joints).isdisjoint(extra_joints)
+        )
+        moved = [entry for entry in self._moved if entry[1] in joints]
+        return row_block(self._columns, rows, moved, base, extras, self._held)
+
+
+def row_block(
+    columns: RowColumns,
+    rows: slice,
+    moved: Sequence[tuple[int, int, float]],
+    base: str = "none",
+    extras: tuple[int, ...] = (),
+    held: Sequence[int] = (),
+) -> RowBlock:
+    """A block of rows.
+
+    What W combines moves no node that the ground holds: `A_x W = 0` says so. Their path sums are zero, and with them
+    the columns of all nodes that move with one.
+
+    Args:
+        columns: of all rows.
+        rows: which of a sample's.
+        moved: nodes that the joints move, ascending: node, joint, ratio of its motion.
+        base: base rows that are combined: "all", "force" or "none".
+        extras: columns of extra parameters.
+        held: nodes that the ground holds, each by six unmeasured components of a wrench.
+    """
+    tree = columns.tree
+    layout = columns.layout
+    numbers = {node: number for number, (node, *_) in enumerate(moved, start=base != "none")}
+    sources: list[int | None] = [None if base == "none" else 0]
+    for node in range(1, tree.n_nodes):
+        sources.append(numbers.get(node, sources[tree.parents[node]]))
+    zero = {None, *(sources[node] for node in held)}
+    kept: list[tuple[int, ...]] = []
+    for all_kept, source in zip(layout.kept, sources, strict=True):
+        demands_no_moment = base == "force" and source == 0
+        of_node = [k for k in all_kept if not demands_no_moment or k < parameters.INERTIA.start]
+        kept.append(() if source in zero else tuple(of_node))
+    nodes = tuple(_runs(layout, kept, sources))
+    inertial = (
+        run.columns.start + len(run.all_kept) * number + k
+        for run in nodes
+        for number in range(len(run.nodes))
+        for k in range(len(run.kept))
+    )
+    return RowBlock(
+        rows=rows,
+        base=base,
+        moved=tuple((node, joint, ratio, sources[tree.parents[node]]) for node, joint, ratio in moved),
+        nodes=nodes,
+        inertial=tuple(inertial),
+        friction=tuple(columns.friction(node) + k for node, *_ in moved for k in range(2)),
+        extras=extras,
+    )
+
+
+def _runs(layout: ColumnLayout, kept: Sequence[tuple[int, ...]], sources: Sequence[int | None]) -> Iterator[Nodes]:
+    """Runs of consecutive nodes that keep the same parameters and have one path sum in common, or successive ones."""
+    start = 0
+    while start < len(sources):
+        end = start + 1
+        if kept[start]:  # which no node without a path sum has
+            steps: list[int] = []
+            while (
+                end < len(sources)
+                and (layout.kept[end], kept[end]) == (layout.kept[start], kept[start])
+                and (step := (sources[end] or 0) - (sources[end - 1] or 0)) in (0, 1)
+                and step == (steps or [step])[0]
+            ):
+                steps.append(step)
+                end += 1
+            yield Nodes(
+                nodes=range(start, end),
+                kept=kept[start],
+                all_kept=layout.kept[start],
+                columns=range(layout.starts[start], layout.starts[end]),
+                sources=range(sources[start] or 0, (sources[end - 1] or 0) + 1),
+            )
+        start = end
+
+
+@dataclass(frozen=True)
 class ContactBody:
     """A body with active contacts.
 
-    `unmeasured`: rows that span the unmeasured wrench directions, `measured`: one row per measured component.
-    `count`: dimension of that span at almost every sample; more rows are reduced to a basis at each. `components`:
-    contact and component of each measured row. `joints`: indices, among the coupled joints, of those that move the
-    body.
+    Attributes:
+        body: its node.
+        unmeasured: contacts with unmeasured components, and these.
+        span: (k, 6), wrenches at the node's joint frame that span the unmeasured ones of every sample; None where these
+            change with the ground's normal.
+        count: dimension of their space at almost every sample; more wrenches are reduced to a basis at each.
+        measured: contact and component of each measured row.
+        joints: indices, among the coupled joints, of those that move the body.
     """
 
     body: int
-    unmeasured: tuple[WrenchRows, ...]
+    unmeasured: tuple[tuple[int, tuple[int, ...]], ...]
+    span: Tensor | None
     count: int
-    measured: tuple[WrenchRows, ...]
-    components: tuple[tuple[int, int], ...]
+    measured: tuple[tuple[int, int], ...]
     joints: tuple[int, ...]
 
     @property
     def is_held(self) -> bool:
         """Whether all six components of a wrench on it are unmeasured, so that no combination of rows moves it."""
-        return [part.rows.shape for part in self.unmeasured] == [(_WRENCH, _WRENCH)]
+        return self.span is not None and len(self.span) == _WRENCH
 
 
 @dataclass(frozen=True)
@@ -366,6 +458,11 @@ class ContactStateLayout:
     wrench_std: Tensor
     blocks: RowBlocks
 
+    @property
+    def measured(self) -> list[tuple[int, int]]:
+        """Contact and component of each measured row, body by body."""
+        return [component for body in self.contact_bodies for component in body.measured]
+
     @cached_property
     def has_own_limbs(self) -> bool:
         """Whether every contact of a floating base has as many unmeasured directions as joints that move it alone."""
@@ -379,7 +476,11 @@ class ContactStateLayout:
 
 
 class ContactStateLayouts:
-    """Layouts of a robot's contact states, with its contacts and sensors."""
+    """Layouts of a robot's contact states, with its contacts and sensors.
+
+    `frames`: node of each contact, and the pose of its frame in the node's joint frame, (4, 4) [m]. `dof_std`: noise of
+    the degrees of freedom.
+    """
 
     def __init__(
         self,
@@ -389,79 +490,65 @@ class ContactStateLayouts:
         sensors: SensorSet,
         extras: Sequence[Extra] = (),
     ) -> None:
-        self.extras = tuple(extras)
         self.columns = columns
         self.contacts = tuple(contacts)
         self.sensors = sensors
+        self.extras = tuple(extras)
         self.frames = [columns.tree.frame(robot, contact.frame, contact.centre) for contact in contacts]
-        self._measured = measured_components(self.contacts, sensors)
-        self._loops = LoopLayouts(robot)
         self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
-        self.rolling = tuple(index for index, contact in enumerate(contacts) if contact.radius)
-        self.along_normal = tuple(index for index, contact in enumerate(contacts) if contact.along_normal)
-        self._points: dict[int, Tensor] = {}
+        self._measured = measured_components(self.contacts, sensors)
+        self._loops = LoopClosures(robot) if robot.loops else None
         self._cache: dict[tuple[ContactState, bool], ContactStateLayout] = {}
-        self._rotations: dict[int, Tensor] = {}
-        self._normals: dict[int, Tensor] = {}
+
+    def clear(self) -> None:
+        """Drop all layouts, when the robot's constants move to another device or precision."""
+        self._cache.clear()
 
     def layout(self, state: ContactState, recorded_normals: bool = False) -> ContactStateLayout:
         """The layout of a contact state, cached.
 
         `recorded_normals`: whether each rolling contact has normals of its own, so that those of one body differ.
         """
-        recorded_normals = recorded_normals and any(state[contact] for contact in self.rolling)
-        key = (state, recorded_normals)
-        if key in self._cache:
-            return self._cache[key]
+        rolls = any(active and contact.radius for active, contact in zip(state, self.contacts, strict=True))
+        key = state, recorded_normals and rolls
+        if key not in self._cache:
+            self._cache[key] = self._layout(*key)
+        return self._cache[key]
+
+    def _layout(self, state: ContactState, recorded_normals: bool) -> ContactStateLayout:
+        columns = self.columns
+        noise = self.sensors.noise
+        base_rows = self.columns.tree.base_rows
         touching: dict[int, list[int]] = {}
-        for contact, active in enumerate(state):
-            if active:
-                touching.setdefault(self.frames[contact][0], []).append(contact)
-        moving = {joint for body in touching for joint in self.columns.joints_above(body)} | self._loops.dofs
+        for contact in np.flatnonzero(state).tolist():
+            touching.setdefault(self.frames[contact][0], []).append(contact)
+        moving = set() if self._loops is None else set(self._loops.dofs)
+        moving.update(joint for body in touching for joint in columns.joints_above(body))
         measured = np.flatnonzero(self.sensors.torque).tolist()
         coupled = tuple(joint for joint in measured if joint in moving)
-        bodies = tuple(
-            self._contact_body(body, members, coupled, recorded_normals) for body, members in touching.items()
-        )
-        loops = tuple(self._loops.rows(coupled, self.columns.tree.joint_map))
-        moved = sorted(
-            (body, index, ratio)
-            for index, joint in enumerate(coupled)
-            for body, ratio in self.columns.joint_rows[joint].moved
-        )
+        bodies = tuple(self._contact_body(*body, coupled, recorded_normals) for body in touching.items())
+        loops = tuple(self._loop_rows(coupled))
         extras = [
-            (self.columns.count + number, extra)
+            (columns.count + number, *self._reach(extra, coupled, bodies))
             for number, extra in enumerate(self.extras)
             if not set(extra.dofs).isdisjoint(coupled) or any(state[contact] for contact, _ in extra.contacts)
         ]
-        noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
-        self._cache[key] = ContactStateLayout(
-            bodies,
-            loops,
-            coupled,
-            {joint: self._uncoupled(joint) for joint in measured if joint not in moving},
-            self._tensor(np.append(noise.base_std[:base_rows], self.dof_std[list(coupled)])),
-            self._tensor(noise.wrench_std[[k for body in bodies for _, k in body.components]]),
-            RowBlocks(
-                self.columns.tree,
-                self.columns.layout,
-                moved,
-                [(self.columns.friction(body), self.columns.friction(body) + 1) for body, _, _ in moved],
-                [body.joints for body in bodies],
-                sum(body.count for body in bodies) + sum(len(loop.wrenches) for loop in loops),
-                [(column, *self._met(extra, coupled, bodies)) for column, extra in extras],
-                [body.body for body in bodies if body.is_held],
-            ),
+        return ContactStateLayout(
+            contact_bodies=bodies,
+            loops=loops,
+            coupled_joints=coupled,
+            uncoupled_joints={joint: self._uncoupled(joint) for joint in measured if joint not in moving},
+            row_std=self._tensor(np.append(noise.base_std[:base_rows], self.dof_std[list(coupled)])),
+            wrench_std=self._tensor(noise.wrench_std[[k for body in bodies for _, k in body.measured]]),
+            blocks=RowBlocks(columns, coupled, bodies, sum(len(loop.wrenches) for loop in loops), extras),
         )
-        return self._cache[key]
 
     def _uncoupled(self, joint: int) -> RowBlock:
-        columns, row = self.columns, self.columns.joint_rows[joint]
-        moved = [(node, 0, ratio, (columns.friction(node), columns.friction(node) + 1)) for node, ratio in row.moved]
-        extras = tuple(columns.count + number for number, extra in enumerate(self.extras) if joint in extra.dofs)
-        return row_block(columns.tree, columns.layout, slice(0, 1), moved, extras=extras)
+        moved = [(node, 0, ratio) for node, ratio in self.columns.joint_rows[joint].moved]
+        extras = tuple(self.columns.count + number for number, extra in enumerate(self.extras) if joint in extra.dofs)
+        return row_block(self.columns, slice(0, 1), moved, extras=extras)
 
-    def _met(
+    def _reach(
         self, extra: Extra, coupled: tuple[int, ...], bodies: Sequence[ContactBody]
     ) -> tuple[tuple[int, ...], bool]:
         """Coupled joints whose rows an extra parameter is in, and whether it is in those of the base."""
@@ -471,153 +558,72 @@ class ContactStateLayouts:
         joints = {joint for body in bodies if body.body in nodes for joint in body.joints}
         return tuple(sorted(joints)), bool(self.columns.tree.base_rows)
 
-    def frame_rotation(self, contact: int) -> Tensor:
-        """Axes of a contact frame in its node's joint frame, (3, 3), cached."""
-        if contact not in self._rotations:
-            self._rotations[contact] = self._tensor(self.frames[contact][1][:3, :3])
-        return self._rotations[contact]
-
-    def frame_origin(self, contact: int) -> Tensor:
-        """Origin of a contact frame in its node's joint frame, (3,) [m], cached."""
-        if contact not in self._points:
-            self._points[contact] = self._tensor(self.frames[contact][1][:3, 3])
-        return self._points[contact]
-
-    def ground(
-        self, states: BodyStates, normals: Tensor | None, rotation_world_base: Tensor | None
-    ) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
-        """What depends on the ground's normal, see `rolling_arms` and `ground_axes`.
-
-        Args:
-            states: of the joint frames.
-            normals: (B, C, 3), in the world; None for those of the contacts.
-            rotation_world_base: (B, 3, 3); None where the base's axes are the world's.
-
-        Returns:
-            Moments of unit forces of the ground on each rolling contact, (3, 3, B) [m], and the ground's axes in base
-            axes, (3, 3, B), of each that is read along its normal.
-        """
-        arms, along = {}, {}
-        for index in dict.fromkeys((*self.rolling, *self.along_normal)):
-            contact, body = self.contacts[index], self.frames[index][0]
-            if normals is None:
-                normal = self._normal(index)[:, None].expand(3, states.position.shape[-1])
-            else:
-                normal = normals[:, index].T
-            if rotation_world_base is not None:
-                normal = (normal.T[:, None] @ rotation_world_base)[:, 0].T
-            if contact.radius:
-                axes, axis = self.frame_rotation(index), contact.rolling_axis
-                arms[index] = contact_arms(states, body, axes, contact.radius, normal, axis)
-            if contact.along_normal:
-                along[index] = ground_axes(normal)
-        return arms, along
-
-    def _normal(self, contact: int) -> Tensor:
-        """Stated normal of a contact, (3,), cached."""
-        if contact not in self._normals:
-            self._normals[contact] = self._tensor(np.array(self.contacts[contact].normal))
-        return self._normals[contact]
-
-    def clear(self) -> None:
-        """Drop all layouts, when the robot's constants move to another device or precision."""
-        self._cache.clear()
-        self._rotations.clear()
-        self._normals.clear()
-        self._points.clear()
+    def _loop_rows(self, coupled: Sequence[int]) -> Iterator[LoopRows]:
+        """Rows of each loop that does work on a coupled joint."""
+        if self._loops is None:
+            return
+        for number, loop in enumerate(self._loops.geometries):
+            loop_dofs = set(loop.dofs(self.columns.tree))
+            joints = tuple(index for index, joint in enumerate(coupled) if joint in loop_dofs)
+            dofs = tuple(coupled[index] for index in joints)
+            wrenches = self._loops.effective_wrenches(number, dofs)
+            if len(wrenches):
+                yield LoopRows(loop, self._tensor(wrenches), joints, dofs)
 
     def _contact_body(
         self, body: int, contacts: list[int], coupled: tuple[int, ...], recorded_normals: bool
     ) -> ContactBody:
-        unmeasured, measured, components = _Grouped(), _Grouped(), []
-        for contact in contacts:
-            at_body = wrench_transform(self.frames[contact][1]).T
-            for k in self.contacts[contact].components:
-                line = self._line_of_action(contact, k)
-                row = at_body[k] if line.ground is None else np.eye(3)[k]
-                if self._measured[contact, k]:
-                    measured.setdefault(line, []).append(row)
-                    components.append((contact, k))
-                else:
-                    alike = self._rolling_alike(line, unmeasured, recorded_normals)
-                    unmeasured.setdefault(alike, []).append(row)
-        components.sort(key=lambda component: list(measured).index(self._line_of_action(*component)))
-        spans = {line: _span(np.array(rows)) for line, rows in unmeasured.items()}
-        count = sum(map(len, spans.values()))
-        if len(spans) > 1 and not any(line.ground is not None for line in spans):
-            count = self._generic_rank(spans)
-            if count == _WRENCH:
-                spans = {LineOfAction(): np.eye(_WRENCH)}
+        components = {contact: self.contacts[contact].components for contact in contacts}
+        measured = [(contact, k) for contact in contacts for k in components[contact] if self._measured[contact, k]]
+        unmeasured = {
+            contact: tuple(k for k in components[contact] if not self._measured[contact, k]) for contact in contacts
+        }
+        unmeasured = {contact: chosen for contact, chosen in unmeasured.items() if chosen}
+        count, span = self._span(unmeasured, recorded_normals)
         above = set(self.columns.joints_above(body))
         joints = tuple(index for index, joint in enumerate(coupled) if joint in above)
-        rows = [
-            tuple(WrenchRows(self._tensor(np.array(x)), line) for line, x in part.items()) for part in (spans, measured)
-        ]
-        return ContactBody(body, rows[0], count, rows[1], tuple(components), joints)
+        return ContactBody(body, tuple(unmeasured.items()), span, count, tuple(measured), joints)
 
-    def _line_of_action(self, contact: int, k: int) -> LineOfAction:
-        """How a component of a contact acts; moments of one that is read along the normal act as they do of others.
+    def _span(self, unmeasured: Mapping[int, tuple[int, ...]], recorded_normals: bool) -> tuple[int, Tensor | None]:
+        """Dimension and, where it is the same at all samples, basis of a body's unmeasured wrenches, (k, 6).
 
-        Forces of several such contacts on a body may span less by chance, as those of cells in a flat sole do: their
-        rank is that of each sample, by its null space.
+        The dimension is that with normals in any directions; it is never larger. Forces of several contacts that are
+        read along the normal may span less by chance, as those of cells in a flat sole do: their rank is that of each
+        sample, by its null space.
         """
-        if contact not in self.along_normal:
-            return LineOfAction(contact if contact in self.rolling else None)
-        return LineOfAction(contact if contact in self.rolling else None, contact) if k < 3 else LineOfAction()
-
-    def _rolling_alike(
-        self, line: LineOfAction, others: Iterable[LineOfAction], recorded_normals: bool
-    ) -> LineOfAction:
-        """The first of other contacts of the body that touches the ground by the same arm from its origin, or itself.
-
-        Forces of contacts with the same arm span a space that is moved as a whole by it.
-        """
-        rolling = line.rolling
-        if rolling is None or line.ground is not None or recorded_normals:
-            return line
-        own = self.contacts[rolling]
-        for other in others:
-            if other.rolling is not None and other.ground is None:
-                contact = self.contacts[other.rolling]
-                alike = (contact.kind, contact.radius, contact.normal) == (own.kind, own.radius, own.normal)
-                if alike and (
-                    own.kind == "point" or np.allclose(self._axis(other.rolling), self._axis(rolling), atol=1e-12)
-                ):
-                    return other
-        return line
-
-    def _axis(self, contact: int) -> Array:
-        """Axis of a cylinder in its node's joint frame, (3,)."""
-        return self.frames[contact][1][:3, "xyz".index(self.contacts[contact].line_axis)]
-
-    def _generic_rank(self, spans: Mapping[LineOfAction, Array]) -> int:
-        """Dimension of the space that wrenches span with normals in any directions; it is never larger."""
-        rng, moved = np.random.default_rng(0), []
-        for (rolling, _), rows in spans.items():
-            if rolling is not None:
-                contact, normal = self.contacts[rolling], torch.from_numpy(_unit(rng.normal(size=3)))[:, None]
-                axis = torch.from_numpy(self._axis(rolling).copy())[:, None] if contact.kind == "line" else None
-                arms = rolling_arms(contact.radius, normal, axis)[..., 0].numpy()
-                rows = np.hstack([rows[:, :3], rows[:, 3:] + rows[:, :3] @ arms.T])
-            moved.append(rows)
-        return len(_span(np.concatenate(moved)))
+        if any(self.contacts[contact].along_normal for contact in unmeasured):
+            return sum(map(len, unmeasured.values())), None
+        rng = np.random.default_rng(0)
+        normals = dict[object, Array]()
+        rows = [np.zeros((0, _WRENCH))]
+        for number, components in unmeasured.items():
+            contact = self.contacts[number]
+            pose = self.frames[number][1]
+            wrenches = wrench_transform(pose).T[list(components)]
+            if contact.radius:
+                key = number if recorded_normals else contact.normal
+                normal = normals.setdefault(key, _unit(rng.normal(size=3)))
+                axis = pose[:3, "xyz".index(contact.line_axis)].copy() if contact.kind == "line" else None
+                arms = _arms(contact.radius, normal, axis)
+                wrenches = np.hstack([wrenches[:, :3], wrenches[:, 3:] + wrenches[:, :3] @ arms.T])
+            rows.append(wrenches)
+        _, values, Vh = np.linalg.svd(np.concatenate(rows), full_matrices=False)
+        span = Vh[is_significant(values, KINEMATIC_TOLERANCE)]
+        if len(span) == _WRENCH:
+            return _WRENCH, self._tensor(np.eye(_WRENCH))
+        return len(span), None if normals else self._tensor(span)
 
     def _tensor(self, values: Array) -> Tensor:
         ancestors = self.columns.tree.ancestors
         return torch.tensor(values, dtype=ancestors.dtype, device=ancestors.device)
 
 
-_WRENCH = 6
-_Grouped = dict[LineOfAction, list[Array]]
-
-
-def _span(rows: Array) -> Array:
-    """Orthonormal rows that span the same wrenches as others, (k, 6)."""
-    _, values, Vh = np.linalg.svd(rows, full_matrices=False)
-    span: Array = Vh[is_significant(values, KINEMATIC_TOLERANCE)]
-    return span
-
-
 def _unit(x: Array) -> Array:
     unit: Array = x / np.linalg.norm(x)
     return unit
+
+
+def _arms(radius: float, normal: Array, axis: Array | None) -> Array:
+    """`rolling_arms` of one sample, (3, 3)."""
+    along = None if axis is None else torch.from_numpy(axis)[:, None]
+    return np.asarray(rolling_arms(radius, torch.from_numpy(normal)[:, None], along)[..., 0])

@@ -111,8 +111,10 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     """
     if builder.extras:
         raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
-    own = corrected_triangle(factor, column_prior(builder, robot, friction))
-    return problem_from_triangle(own.R, factor.rows, factor.oversampling, builder, robot, friction, own.shrinkage)
+    corrected = corrected_triangle(factor, column_prior(builder, robot, friction))
+    return problem_from_triangle(
+        corrected.R, factor.rows, factor.oversampling, builder, robot, friction, corrected.shrinkage
+    )
 
 
 @one_thread()
@@ -145,15 +147,16 @@ def assemble(
         problem = problem_from_triangle(of_all_logs, everything.rows, oversampling, builder, robot, friction, shrinkage)
         return Assembly(problem, (), problem, noise, forces)
     count = builder.columns.count
-    per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
+    per_log = [number for number, extra in enumerate(builder.extras) if extra.per_log]
+    of_all = [number for number, extra in enumerate(builder.extras) if not extra.per_log]
     eliminations, rows = list[Elimination](), of_all_logs
     if per_log:
         eliminations, rows, shrinkage = _eliminate_per_log(parts, builder, prior, per_log)
     if of_all:
         extras = tuple(builder.extras[number] for number in of_all)
         sizes = np.linalg.norm(of_all_logs[:, [count + number for number in of_all]], axis=0)
-        rest = np.delete(rows, np.s_[count:-1], axis=1)
-        elimination, rows = _eliminate("", extras, rows[:, count:-1], rest, builder, sizes)
+        others = np.delete(rows, np.s_[count:-1], axis=1)
+        elimination, rows = _eliminate("", extras, rows[:, count:-1], others, builder, sizes)
         eliminations.append(elimination)
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
     spent = oversampling * sum(elimination.inverse.shape[1] for elimination in eliminations)
@@ -178,12 +181,12 @@ def _eliminate_per_log(
     extras, at = tuple(builder.extras[number] for number in numbers), [builder.columns.count + n for n in numbers]
     eliminations, remaining, lacking = [], [], []
     for source in dict.fromkeys(part.source for part in parts):
-        own = corrected_triangle(merge_factors((p.factor for p in parts if p.source == source), builder), prior)
-        columns, rest = own.R[:, at], np.delete(own.R, at, axis=1)
-        elimination, rest = _eliminate(source, extras, columns, rest, builder, np.linalg.norm(columns, axis=0))
+        corrected = corrected_triangle(merge_factors((p.factor for p in parts if p.source == source), builder), prior)
+        columns, others = corrected.R[:, at], np.delete(corrected.R, at, axis=1)
+        elimination, others = _eliminate(source, extras, columns, others, builder, np.linalg.norm(columns, axis=0))
         eliminations.append(elimination)
-        remaining.append(rest)
-        lacking.append((rest, None if own.shrinkage is None else np.delete(own.shrinkage, at, 0)))
+        remaining.append(others)
+        lacking.append((others, None if corrected.shrinkage is None else np.delete(corrected.shrinkage, at, 0)))
     rows = np.asarray(np.linalg.qr(np.concatenate(remaining), mode="r"))
     return eliminations, rows, _joined_shrinkage(lacking)
 
@@ -270,16 +273,17 @@ def _joined_shrinkage(logs: Sequence[tuple[Array, Array | None]]) -> Array | Non
     width = max((shrinkage.shape[1] for _, shrinkage in logs if shrinkage is not None), default=0)
     if not width:
         return None
-    rows = np.concatenate([rest[:, :-1] for rest, _ in logs])
+    rows = np.concatenate([others[:, :-1] for others, _ in logs])
     lacking = [
-        np.zeros((len(rest), width)) if shrinkage is None else rest[:, :-1] @ shrinkage for rest, shrinkage in logs
+        np.zeros((len(others), width)) if shrinkage is None else others[:, :-1] @ shrinkage
+        for others, shrinkage in logs
     ]
     scale = column_scale(rows)
     return np.asarray(scale[:, None] * (np.linalg.pinv(rows * scale, rcond=RANK_TOLERANCE) @ np.concatenate(lacking)))
 
 
 def _eliminate(
-    log: str, extras: tuple[Extra, ...], columns: Array, rest: Array, builder: RowBuilder, sizes: Array
+    log: str, extras: tuple[Extra, ...], columns: Array, others: Array, builder: RowBuilder, sizes: Array
 ) -> tuple[Elimination, Array]:
     """Eliminate the unknowns of some columns, (R, M), from the rows of the others, (R, ...), right-hand side last.
 
@@ -287,8 +291,8 @@ def _eliminate(
     """
     present = is_significant(sizes)
     scale = np.where(present, sizes, 1.0)
-    U, values, V, remaining = _project_off(np.where(present, columns / scale, 0.0), rest)
-    top, count = U.T @ rest, builder.columns.count
+    U, values, V, remaining = _project_off(np.where(present, columns / scale, 0.0), others)
+    top, count = U.T @ others, builder.columns.count
     C = np.hstack([top[:, :count] @ builder.columns.parameter_map, top[:, count:-1]])
     std_if_known = np.where(present, 1.0 / scale, np.inf)
     unobservable = np.eye(len(extras)) - V @ V.T
@@ -305,10 +309,10 @@ def eliminate_columns(X: Array, unknown: Sequence[int]) -> Array:
     return _project_off(columns * column_scale(columns), np.delete(X, unknown, axis=1))[-1]
 
 
-def _project_off(columns: Array, rest: Array) -> tuple[Array, Array, Array, Array]:
+def _project_off(columns: Array, others: Array) -> tuple[Array, Array, Array, Array]:
     """U, singular values and V of columns of norm 1 or 0, and the other columns projected off their span."""
     U, values, Vt = np.linalg.svd(columns, full_matrices=True)
     rank = int((values > RANK_TOLERANCE).sum())
-    projected = U[:, rank:].T @ rest
-    projected[:, np.linalg.norm(projected, axis=0) < RANK_TOLERANCE * np.linalg.norm(rest, axis=0)] = 0.0  # rounding
+    projected = U[:, rank:].T @ others
+    projected[:, np.linalg.norm(projected, axis=0) < RANK_TOLERANCE * np.linalg.norm(others, axis=0)] = 0.0  # rounding
     return U[:, :rank], values[:rank], Vt[:rank].T, projected

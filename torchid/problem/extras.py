@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,15 +12,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchid.logs.columns import fits
+from torchid.problem.samples import Samples
+from torchid.regressor.tree import KinematicTree
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.sensors import measured_components, recorded_components
-
-if TYPE_CHECKING:
-    from torchid.problem.contact_state import ContactStateLayout, FramePoses
-    from torchid.problem.samples import Samples
-    from torchid.regressor.tree import KinematicTree
 
 CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment")
 """Kinds of sensor channels, as `SensorNoise` has them."""
@@ -267,8 +264,8 @@ class NoiseGroups:
         values = {**self.values(guess), **known}
         joints = self.names[: len(self.joints)]
         for index in self.alike(joints):
-            own = [known[joints[k]] for k in index if joints[k] in known]
-            mean = float(np.exp(np.mean(np.log(own)))) if own else None
+            known_alike = [known[joints[k]] for k in index if joints[k] in known]
+            mean = float(np.exp(np.mean(np.log(known_alike)))) if known_alike else None
             values |= {joints[k]: mean for k in index if mean is not None and joints[k] not in known}
         force, moment = ((values[x], values[y], values[z]) for x, y, z in (BASE_GROUPS[:3], BASE_GROUPS[3:]))
         others = {name: values[name] for name in self.names if "." not in name}
@@ -303,46 +300,6 @@ def contact_extra_column(extra: Extra, samples: Samples, contact: int, axis: int
         return samples.active[:, contact].to(samples.time) if samples.share is None else samples.share[:, contact]
     reading = samples.wrench
     return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, contact, axis]
-
-
-def extra_columns(
-    extras: Sequence[Extra],
-    samples: Samples,
-    layout: ContactStateLayout,
-    tree: KinematicTree,
-    measured: Tensor,
-    W: Tensor,
-    poses: dict[int, FramePoses],
-) -> Iterator[Tensor]:
-    """Columns of extra parameters in coupled rows, (r, B) each.
-
-    Args:
-        extras: the parameters.
-        samples: B of one contact state and rank.
-        layout: of that state.
-        tree: of the robot.
-        measured: (B, k_m, base rows + coupled joints), rows of the contact Jacobian of the measured components.
-        W: (B, base rows + coupled joints, r), the basis.
-        poses: by contact, of its frame in the world where wrenches were recorded along the world's axes; none of a
-            contact that is read along the ground's normal.
-    """
-    projected = (measured @ W).permute(1, 2, 0)  # rows per unit of each measured component
-    components = [component for body in layout.contact_bodies for component in body.components]
-    for extra in extras:
-        column = W.new_zeros(W.shape[2], len(samples))
-        for dof in extra.dofs:
-            if dof in layout.coupled_joints:
-                row = W[:, tree.base_rows + layout.coupled_joints.index(dof)]
-                column = column + row.T * dof_extra_column(extra, dof, samples, tree)
-        for contact, axis in extra.contacts:
-            reading = contact_extra_column(extra, samples, contact, axis)
-            own = poses.get(contact)
-            unit = None if own is None else own.of_unit(axis)
-            for k in [axis] if own is None else own.reached(axis):
-                if (contact, k) in components:
-                    along = reading if unit is None else unit[:, k] * reading
-                    column = column + projected[components.index((contact, k))] * along
-        yield column
 
 
 class KnownTorques:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, TypeVar, cast
@@ -87,17 +87,21 @@ class EliminatedTerms:
             nominal: (P,), the values of the others.
         """
         return tuple(
-            one
-            for one in self.conditions
-            if not one.parameters.any() or one.parameters[free].any() or one.parameters @ nominal > 0.0
+            condition
+            for condition in self.conditions
+            if not condition.parameters.any()
+            or condition.parameters[free].any()
+            or condition.parameters @ nominal > 0.0
         )
 
     def at_bounds(self, phi: Array, psi: Array | None) -> frozenset[str]:
         """Labels of terms of conditions that hold with equality at phi (P,) and psi (M,); none without psi."""
         if psi is None:
             return frozenset()
-        standing = [one for one in self.conditions if one.value(phi, psi) <= AT_BOUND * one.size]
-        return frozenset(self.labels[number] for one in standing for number in np.flatnonzero(one.terms))
+        standing = [
+            condition for condition in self.conditions if condition.value(phi, psi) <= AT_BOUND * condition.size
+        ]
+        return frozenset(self.labels[number] for condition in standing for number in np.flatnonzero(condition.terms))
 
 
 T = TypeVar("T")
@@ -247,6 +251,10 @@ def parameter_scale(nominal: Array) -> Array:
     return scale
 
 
+_TENSORS = ("blocks", "noise_gram")
+
+
+@dataclass(repr=False, eq=False)
 class TriangularFactor:
     """R with `R^T R = X^T X` for all rows X added so far, right-hand side as the last column.
 
@@ -257,54 +265,30 @@ class TriangularFactor:
     Attributes:
         columns: of the rows, without the right-hand side.
         rows, independent_rows: that were added.
+        blocks: rows (M, len(support) + 1) that stand for all that were added with the same columns, by these columns.
         noise_gram: what noise of the motion adds to X^T X on average, by the columns of the rows that have it,
             (len(support) + 1, len(support) + 1); an estimate, see `torchid.problem.noise_gram`.
     """
+
+    columns: int
+    rows: int = 0
+    independent_rows: float = 0.0
+    blocks: dict[tuple[int, ...], Tensor] = field(default_factory=dict)
+    noise_gram: dict[tuple[int, ...], Tensor] = field(default_factory=dict)
 
     __repr__ = short_repr
 
     def _headline(self) -> str:
         return f"of {self.rows} whitened rows, {self.columns} columns and the right-hand side"
 
-    def __init__(self, columns: int) -> None:
-        """Start empty, for `columns` columns and one right-hand side."""
-        self.columns = columns
-        self.rows = 0
-        self.independent_rows = 0.0
-        self._blocks: dict[tuple[int, ...], Tensor] = {}
-        self.noise_gram: dict[tuple[int, ...], Tensor] = {}
-
-    @classmethod
-    def from_blocks(
-        cls,
-        columns: int,
-        rows: int,
-        independent_rows: float,
-        blocks: Mapping[tuple[int, ...], Tensor],
-        noise_gram: Mapping[tuple[int, ...], Tensor] | None = None,
-    ) -> TriangularFactor:
-        """The factor that has these `blocks`, of so many rows, and this noise Gram matrix."""
-        out = cls(columns)
-        out.rows, out.independent_rows, out._blocks = rows, independent_rows, dict(blocks)
-        out.noise_gram = dict(noise_gram or {})
-        return out
-
-    @property
-    def blocks(self) -> Mapping[tuple[int, ...], Tensor]:
-        """Rows (M, len(support) + 1) that stand for all that were added with the same columns, by these columns."""
-        return self._blocks
-
     def __getstate__(self) -> dict[str, object]:
-        """What another process gets: on the CPU, as it may have another device."""
-        tensors = {"_blocks": self._blocks, "noise_gram": self.noise_gram}
-        return vars(self) | {name: {at: x.cpu().numpy() for at, x in by.items()} for name, by in tensors.items()}
+        """What another process gets: arrays, as it may have another device."""
+        return vars(self) | {name: {at: x.cpu().numpy() for at, x in vars(self)[name].items()} for name in _TENSORS}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take over what another process sent."""
-        arrays = {
-            name: {at: torch.from_numpy(x) for at, x in state[name].items()} for name in ("_blocks", "noise_gram")
-        }
-        vars(self).update(state | arrays)
+        tensors = {name: {at: torch.from_numpy(x) for at, x in state[name].items()} for name in _TENSORS}
+        vars(self).update(state | tensors)
 
     @property
     def oversampling(self) -> float:
@@ -336,12 +320,12 @@ class TriangularFactor:
             self.add(support, stacked[room:], oversampling)
             return
         self.count(count, oversampling)
-        kept = self._blocks.get(support)
+        kept = self.blocks.get(support)
         above = 0 if kept is None else len(kept)
         stacked[: room - above] = 0.0
         if kept is not None:
             stacked[room - above : room] = kept
-        self._blocks[support] = triangularize(stacked)
+        self.blocks[support] = triangularize(stacked)
 
     def merge(self, *others: TriangularFactor) -> None:
         """Add the rows of other factors.
@@ -355,14 +339,14 @@ class TriangularFactor:
                 raise ValueError(f"merge: found a factor of {other.columns} columns; accepted: {self.columns} columns")
             self.rows += other.rows
             self.independent_rows += other.independent_rows
-            for support, block in other._blocks.items():
+            for support, block in other.blocks.items():
                 blocks.setdefault(support, []).append(block)
             self.add_noise_gram(other.noise_gram)
-        for support, own in blocks.items():
-            if support not in self._blocks:
-                self._blocks[support] = own.pop(0)
-            for start in range(0, len(own), _MERGED):
-                self.absorb(support, torch.cat(own[start : start + _MERGED]))
+        for support, added in blocks.items():
+            if support not in self.blocks:
+                self.blocks[support] = added.pop(0)
+            for start in range(0, len(added), _MERGED):
+                self.absorb(support, torch.cat(added[start : start + _MERGED]))
 
     def add_noise_gram(self, noise_gram: Mapping[tuple[int, ...], Tensor], weight: float = 1.0) -> None:
         """Add to the noise Gram matrix, by columns, times the weight of rows."""
@@ -372,36 +356,33 @@ class TriangularFactor:
 
     def scaled(self, factor: float) -> TriangularFactor:
         """The factor of the same rows times a number."""
-        blocks = {support: factor * block for support, block in self._blocks.items()}
+        blocks = {support: factor * block for support, block in self.blocks.items()}
         noise_gram = {support: factor**2 * x for support, x in self.noise_gram.items()}
-        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks, noise_gram)
+        return replace(self, blocks=blocks, noise_gram=noise_gram)
 
     def to_cpu(self) -> TriangularFactor:
         """The factor on the CPU, which factorizes as few rows as factors have in less time than a GPU."""
-        blocks = {support: block.cpu() for support, block in self._blocks.items()}
-        noise_gram = {support: x.cpu() for support, x in self.noise_gram.items()}
-        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks, noise_gram)
+        blocks = {support: block.to("cpu", torch.float64) for support, block in self.blocks.items()}
+        noise_gram = {support: x.to("cpu", torch.float64) for support, x in self.noise_gram.items()}
+        return replace(self, blocks=blocks, noise_gram=noise_gram)
 
     def compact(self) -> TriangularFactor:
         """The factor on the CPU, as one triangle in all columns if that has fewer numbers than its blocks."""
-        sizes = ((len(block), block.shape[1]) for block in self._blocks.values())
+        sizes = ((len(block), block.shape[1]) for block in self.blocks.values())
         numbers = sum(rows * width - (rows * (rows - 1) // 2 if rows == width else 0) for rows, width in sizes)
         if numbers <= (self.columns + 1) * (self.columns + 2) // 2:
-            blocks = {support: block.to("cpu", torch.float64) for support, block in self._blocks.items()}
-            noise_gram = {support: x.to("cpu", torch.float64) for support, x in self.noise_gram.items()}
-        else:
-            every = tuple(range(self.columns))
-            blocks = {every: self.triangle().triu()}
-            noise_gram = {support: x for support, x in self.noise_gram.items() if len(support) == 1}
-            if len(noise_gram) < len(self.noise_gram):
-                noise_gram[every] = self.whole_noise_gram(dict.fromkeys(every, 0.0))
-        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks, noise_gram)
+            return self.to_cpu()
+        every = tuple(range(self.columns))
+        noise_gram = {support: x for support, x in self.noise_gram.items() if len(support) == 1}
+        if len(noise_gram) < len(self.noise_gram):
+            noise_gram[every] = self.whole_noise_gram(dict.fromkeys(every, 0.0))
+        return replace(self, blocks={every: self.triangle().triu()}, noise_gram=noise_gram)
 
     def triangle(self) -> Tensor:
         """Upper triangular R, (columns + 1, columns + 1), float64 on the CPU."""
         total = torch.zeros(self.columns + 1, self.columns + 1, dtype=torch.float64)
         scattered = [total]
-        for support, block in self._blocks.items():
+        for support, block in self.blocks.items():
             wide = torch.zeros(block.shape[0], self.columns + 1, dtype=torch.float64)
             wide[:, [*support, self.columns]] = block.to("cpu", torch.float64)
             scattered.append(wide)
@@ -430,9 +411,9 @@ class TriangularFactor:
     @torch.no_grad()
     def absorb(self, support: tuple[int, ...], rows: Tensor) -> None:
         """Add rows (M, len(support) + 1), or a factor of them, without counting them."""
-        kept = self._blocks.get(support)
+        kept = self.blocks.get(support)
         stacked = torch.cat([rows.T] if kept is None else [kept.T, rows.T], dim=1).T
-        self._blocks[support] = stacked if len(stacked) < stacked.shape[1] else triangularize(stacked)
+        self.blocks[support] = stacked if len(stacked) < stacked.shape[1] else triangularize(stacked)
 
 
 def gram_matrix(X: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -19,7 +19,8 @@ from torchid.parameters import GRAVITY, MASS, Array
 from torchid.problem.chunks import CHUNK, ProgressCallback, blocks_in, chunks_by_state, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ACTUATORS, Extra, ExtraTerms, contact_extra_column, dof_extra_column
-from torchid.problem.rows import ChunkDynamics, ChunkKinematics, RowBuilder, leave_out_torques
+from torchid.problem.null_bases import leave_out_torques
+from torchid.problem.rows import EVERY, Chunk, RowBuilder
 from torchid.problem.samples import Samples
 from torchid.regressor.regressor import friction_columns, generalized_forces, joint_row
 from torchid.regressor.tree import KinematicTree
@@ -27,6 +28,11 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 _ROWS = 2**16  # of a log on disk that are in memory at a time
+_DENSE_CHUNK = 512  # samples whose rows are dense
+_NOISE_SAMPLES = 64  # of a chunk, for the noise of its measured forces
+
+
+# ------------------------------------------------------------------------------------------------ calibrated readings
 
 
 def calibrate_readings(samples: Samples, extras: Sequence[Extra], values: Array, tree: KinematicTree) -> Samples:
@@ -66,39 +72,32 @@ def _readings(samples: Samples, calibration: Sequence[tuple[Extra, float]], tree
             continue
         if name not in copies:
             copies[name] = recorded.clone()
+        copy = copies[name]
         for dof in extra.dofs:
-            copies[name][:, dof] -= value * dof_extra_column(extra, dof, samples, tree)
+            copy[:, dof] -= value * dof_extra_column(extra, dof, samples, tree)
         for contact, axis in extra.contacts:
-            copies[name][:, contact, axis] -= value * contact_extra_column(extra, samples, contact, axis)
+            copy[:, contact, axis] -= value * contact_extra_column(extra, samples, contact, axis)
     return copies
 
 
-@dataclass(frozen=True)
-class GeneralizedForces:
-    """Generalized forces of some samples, rows as in K: base force, base moment, joints.
-
-    `measured`, (B, n_rows): S^T tau + J_C^T lambda [N, N m], NaN where a force that enters was not measured. `torque`,
-    (B, n_rows): the part S^T tau. `predicted`, (M, B, n_rows): K phi for M parameter vectors.
-    """
-
-    measured: Tensor
-    torque: Tensor
-    predicted: Tensor
+# ------------------------------------------------------------------------------------------------- forces of a chunk
 
 
-def predict_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
+def predict_forces(builder: RowBuilder, chunk: Chunk, phi: Tensor) -> Tensor:
     """K phi, (M, n_rows, B), for M parameter vectors (M, columns) in the builder's columns, without extras.
 
-    Row by row: no more of K than one of its rows is ever formed. `dynamics`: whole ones.
+    Row by row: no more of K than one of its rows is ever formed. `chunk`: with whole wrenches.
     """
-    tree, columns = builder.tree, builder.columns
-    inertial, base = columns.layout.count, tree.base_rows
-    out = phi.new_empty(tree.n_rows, len(phi), dynamics.wrenches.shape[-1])
-    torch.matmul(phi[:, :inertial], dynamics.wrenches[:base], out=out[:base])
+    tree = builder.tree
+    columns = builder.columns
+    inertial = columns.layout.count
+    base = tree.base_rows
+    out = phi.new_empty(tree.n_rows, len(phi), len(chunk))
+    torch.matmul(phi[:, :inertial], chunk.wrenches[:base], out=out[:base])
     for row, forces in zip(columns.joint_rows, out[base:], strict=True):
-        block = joint_row(row, tree, columns.layout, dynamics.screw_axes, dynamics.wrenches)
+        block = joint_row(row, tree, columns.layout, chunk.screw_axes, chunk.wrenches)
         torch.mm(phi[:, row.start : row.end], block, out=forces)
-        for body, *friction in friction_columns(row, dynamics.joints):
+        for body, *friction in friction_columns(row, chunk.joints):
             at = columns.friction(body)
             forces.addmm_(phi[:, at : at + 2], torch.stack(friction))
     return out.transpose(0, 1)
@@ -109,82 +108,11 @@ def with_payload_columns(builder: RowBuilder, samples: Samples, phi: Tensor) -> 
     return phi if samples.payload is None else phi + builder.to_columns(samples.payload[None]).to(phi)
 
 
-def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, kinematics: ChunkKinematics) -> Tensor:
-    """J_C^T lambda, (n_rows, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
-    tree = builder.tree
-    total = samples.time.new_zeros(tree.n_rows, len(samples))
-    for contact, active in enumerate(state):
-        if active:
-            body, _ = builder.frames[contact]
-            possible = list(builder.contacts[contact].components)
-            components = builder.recorded_wrench(samples, contact, kinematics)[:, possible].T
-            at_base = builder.unit_wrenches(kinematics, contact, possible)
-            wrench = (at_base * components).sum(1, keepdim=True)
-            joints = builder.columns.joints_above(body)  # other rows must not become NaN by an unmeasured force
-            rows = builder.columns.rows_above(body)
-            total[rows] += generalized_forces(tree, kinematics.screw_axes, body, wrench, joints)[0]
-    return total
-
-
-def reading_variance(
-    builder: RowBuilder, samples: Samples, state: ContactState, kinematics: ChunkKinematics, noise: SensorNoise
-) -> Tensor:
-    """Variance of S^T tau + J_C^T lambda by the noise of the readings, (B, n_rows) [N^2, (N m)^2].
-
-    A filter leaves a share of it, `noise_left` of the samples. NaN where a reading that enters, or its
-    noise, is not known.
-
-    Args:
-        builder: with all recorded sensors.
-        samples: of one contact state.
-        state: that state.
-        kinematics: of the samples.
-        noise: standard deviations of the readings as recorded, NaN where unknown.
-    """
-    tree = builder.tree
-    total = samples.time.new_zeros(tree.n_rows, len(samples))
-    std = noise.dof_std(tree.n, tree.n_dofs)
-    std[list(builder.motors.passive)] = np.nan
-    torque = builder.recorded_torque(samples).T
-    total[tree.base_rows :] = total.new_tensor(std**2)[:, None] + 0.0 * torque  # NaN where it was not recorded
-    for contact, active in enumerate(state):
-        if active:
-            body, _ = builder.frames[contact]
-            possible = list(builder.contacts[contact].components)
-            wrenches = builder.unit_wrenches(kinematics, contact, possible, noise.wrench_std)
-            joints = builder.columns.joints_above(body)
-            rows = builder.columns.rows_above(body)
-            recorded = 0.0 * builder.recorded_wrench(samples, contact, kinematics)[:, possible].sum(1)
-            forces = total.new_zeros(len(possible), *total.shape)
-            forces[:, rows] = generalized_forces(tree, kinematics.screw_axes, body, wrenches, joints)
-            total += builder.motors.of(tree, kinematics, forces.mT).mT.square().sum(0)
-            total[rows] += recorded
-    return total.T * samples.noise_left
-
-
-def measured_and_predicted_forces(
-    builder: RowBuilder, samples: Samples, state: ContactState, phi: Mapping[int, Tensor], dynamics: ChunkDynamics
-) -> GeneralizedForces:
-    """Measured and predicted forces of samples that share a contact state; `phi` is (M, width) by fold.
-
-    Sensors are taken as calibrated: of the extras only those of actuators enter. A payload adds to each `phi`, known
-    armatures and springs to each prediction.
-    """
+def _predicted(builder: RowBuilder, chunk: Chunk, phi: Tensor) -> Tensor:
+    """Forces (M, B, n_rows) at parameters (M, width), with payloads, known torques and extras of actuators."""
+    samples = chunk.samples
     base_rows = builder.tree.base_rows
-    torque = torch.nn.functional.pad(builder.recorded_torque(samples), (base_rows, 0))
-    measured = torque + contact_forces(builder, samples, state, dynamics).T
-    by_fold = [
-        _predicted(builder, samples[start:end], dynamics.select(slice(start, end)), phi[fold])
-        for fold, _, start, end in blocks_in(samples)
-    ]
-    predicted = by_fold[0] if len(by_fold) == 1 else torch.cat(by_fold, dim=1)
-    return GeneralizedForces(measured, torque, predicted)
-
-
-def _predicted(builder: RowBuilder, samples: Samples, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
-    """What `measured_and_predicted_forces` predicts at parameters (M, width), (M, B, n_rows)."""
-    predicted = predict_forces(builder, dynamics, with_payload_columns(builder, samples, phi)).mT
-    base_rows = builder.tree.base_rows
+    predicted = predict_forces(builder, chunk, with_payload_columns(builder, samples, phi)).mT
     if not builder.known_torques.none:
         predicted[..., base_rows:] += builder.known_torques.of(samples)
     for number, extra in enumerate(builder.extras, start=builder.columns.count):
@@ -194,39 +122,64 @@ def _predicted(builder: RowBuilder, samples: Samples, dynamics: ChunkDynamics, p
     return predicted
 
 
-def _on_device(
-    builder: RowBuilder, samples: Samples, chunk: int = CHUNK
-) -> Iterator[tuple[Samples, ContactState, slice | np.ndarray]]:
-    """A log in chunks of one contact state on the builder's device, and where in its order these belong."""
-    for state, index in chunks_by_state(samples, chunk):
-        yield samples[index].to(builder.device), state, index if isinstance(index, slice) else index.numpy()
+def _predicted_by_fold(builder: RowBuilder, chunk: Chunk, phi: Mapping[int, Tensor]) -> Tensor:
+    """Forces (M, B, n_rows) at parameters (M, width) of each sample's fold."""
+    parts = [
+        _predicted(builder, chunk.select(slice(start, end)), phi[fold])
+        for fold, _, start, end in blocks_in(chunk.samples)
+    ]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
 
-@one_thread()
-@torch.no_grad()
-def noise_series(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Array:
-    """Standard deviation of the measured forces of a log in its order by `reading_variance`, (N, n_rows) [N, N m]."""
-    out = np.empty((len(samples), builder.tree.n_rows))
-    for chunk, state, where in _on_device(builder, samples):
-        variance = reading_variance(builder, chunk, state, builder.kinematics(chunk), noise)
-        out[where] = variance.sqrt().cpu().numpy()
-    return out
+def _joint_forces(builder: RowBuilder, chunk: Chunk) -> Tensor:
+    """S^T tau, (B, n_rows) [N m], NaN where it was not measured."""
+    return torch.nn.functional.pad(builder.recorded_torque(chunk.samples), (builder.tree.base_rows, 0))
 
 
-@one_thread()
-@torch.no_grad()
-def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
-    """Measured (N, n_rows) and predicted (M, N, n_rows) forces of a log in its order, `phi` as for `to_columns`."""
-    columns, workspace = builder.to_columns(phi), builder.workspaces.take()
-    n_rows = builder.tree.n_rows
-    measured, predicted = np.empty((len(samples), n_rows)), np.empty((len(phi), len(samples), n_rows))
-    for chunk, state, where in _on_device(builder, samples):
-        dynamics = builder.dynamics(chunk, workspace, whole=True)
-        forces = measured_and_predicted_forces(builder, chunk, state, {chunk.fold: columns}, dynamics)
-        measured[where] = forces.measured.cpu().numpy()
-        predicted[:, where] = forces.predicted.cpu().numpy()
-    builder.workspaces.give_back(workspace)
-    return measured, predicted
+def _contact_forces(builder: RowBuilder, chunk: Chunk, state: ContactState) -> Tensor:
+    """J_C^T lambda, (B, n_rows), over the active contacts; NaN in the rows that an unmeasured component reaches."""
+    tree = builder.tree
+    total = chunk.screw_axes.new_zeros(tree.n_rows, len(chunk))
+    for contact in np.flatnonzero(state).tolist():
+        body, _ = builder.frames[contact]
+        possible = list(builder.contacts[contact].components)
+        components = builder.recorded_wrench(chunk, contact)[:, possible].T
+        wrench = (builder.unit_wrenches(chunk, contact, possible) * components).sum(1, keepdim=True)
+        joints = builder.columns.joints_above(body)  # other rows must not become NaN by an unmeasured force
+        rows = builder.columns.rows_above(body)
+        total[rows] += generalized_forces(tree, chunk.screw_axes, body, wrench, joints)[0]
+    return total.T
+
+
+def reading_variance(builder: RowBuilder, chunk: Chunk, state: ContactState, noise: SensorNoise) -> Tensor:
+    """Variance of S^T tau + J_C^T lambda by the noise of the readings, (B, n_rows) [N^2, (N m)^2].
+
+    A filter leaves a share of it, `noise_left` of the samples. NaN where a reading that enters, or its
+    noise, is not known.
+
+    Args:
+        builder: with all recorded sensors.
+        chunk: samples of one contact state.
+        state: that state.
+        noise: standard deviations of the readings as recorded, NaN where unknown.
+    """
+    tree = builder.tree
+    std = noise.dof_std(tree.n, tree.n_dofs)
+    std[list(builder.motors.passive)] = np.nan
+    total = chunk.screw_axes.new_zeros(tree.n_rows, len(chunk))
+    unknown = 0.0 * builder.recorded_torque(chunk.samples).T  # NaN where it was not recorded
+    total[tree.base_rows :] = total.new_tensor(std**2)[:, None] + unknown
+    for contact in np.flatnonzero(state).tolist():
+        body, _ = builder.frames[contact]
+        possible = list(builder.contacts[contact].components)
+        wrenches = builder.unit_wrenches(chunk, contact, possible, noise.wrench_std)
+        rows = builder.columns.rows_above(body)
+        forces = total.new_zeros(len(possible), *total.shape)
+        joints = builder.columns.joints_above(body)
+        forces[:, rows] = generalized_forces(tree, chunk.screw_axes, body, wrenches, joints)
+        total += builder.motors.of(tree, chunk.states, forces.mT).mT.square().sum(0)
+        total[rows] += 0.0 * builder.recorded_wrench(chunk, contact)[:, possible].sum(1)
+    return total.T * chunk.samples.noise_left
 
 
 def centre_of_pressure(wrench: Tensor, normal: Tensor, height: Tensor, least: float = 0.0) -> Tensor:
@@ -237,70 +190,45 @@ def centre_of_pressure(wrench: Tensor, normal: Tensor, height: Tensor, least: fl
 
     Source: Sardain, Bessonnet, "Forces acting on a biped robot. Center of pressure - zero moment point", 2004.
     """
-    force, moment = wrench[..., :3], wrench[..., 3:]
+    force = wrench[..., :3]
+    moment = wrench[..., 3:]
     across = torch.linalg.cross(normal.expand_as(moment), moment)
     carried = (force * normal).sum(-1, keepdim=True)
     return (across - height[:, None] * force) / carried.where(carried > least, torch.nan)
 
 
-def pressure_centres(
-    builder: RowBuilder, samples: Samples, state: ContactState, at: ChunkKinematics, wrench: Tensor, least: float
-) -> Tensor:
+def _pressure_centres(builder: RowBuilder, chunk: Chunk, state: ContactState, wrench: Tensor, least: float) -> Tensor:
     """`centre_of_pressure` of wrenches (M, B, 6) on the mean plane of active contacts; NaN without any, or attitude."""
-    active, rotation = [k for k, touches in enumerate(state) if touches], at.rotation_world_base
+    active = np.flatnonzero(state).tolist()
+    rotation = chunk.rotation
+    recorded = chunk.samples.contact_normal
     if rotation is None or not active:
         return torch.full_like(wrench[..., :3], torch.nan)
-    contacts, states = [builder.contacts[k] for k in active], at.states
-    normals = wrench.new_tensor([contact.normal for contact in contacts])
-    normals = (normals if samples.contact_normal is None else samples.contact_normal[:, active]) @ rotation
-    radii = wrench.new_tensor([contact.radius for contact in contacts])
-    frames = [(node, wrench.new_tensor(T[:3, 3])) for node, T in (builder.frames[k] for k in active)]
-    points = [states.position[:, node] + point @ states.rotation[:, :, node] for node, point in frames]
+    normals = (builder.normals[active].to(wrench) if recorded is None else recorded[:, active]) @ rotation
+    radii = wrench.new_tensor([builder.contacts[contact].radius for contact in active])
+    points = []
+    for contact in active:
+        node = builder.frames[contact][0]
+        origin = builder.frame_origin[contact]
+        points.append(chunk.states.position[:, node] + origin @ chunk.states.rotation[:, :, node])
     soles = torch.stack(points).permute(2, 0, 1) - radii[:, None] * normals
     normal = torch.nn.functional.normalize(normals.mean(1), dim=1)
     return centre_of_pressure(wrench, normal, -(soles @ normal[..., None]).mean((1, 2)), least)
 
 
-@one_thread()
-@torch.no_grad()
-def pressure_series(builder: RowBuilder, samples: Samples, wrenches: Array, least: float) -> Array:
-    """`pressure_centres` of wrenches (M, N, 6) of a log in its order, (M, N, 3) [m]."""
-    out = np.empty((*wrenches.shape[:2], 3))
-    for chunk, state, where in _on_device(builder, samples):
-        wrench, kinematics = torch.from_numpy(wrenches[:, where]).to(chunk.time), builder.kinematics(chunk)
-        out[:, where] = pressure_centres(builder, chunk, state, kinematics, wrench, least).cpu().numpy()
-    return out
-
-
-@one_thread()
-@torch.no_grad()
-def null_space_part(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
-    """V_x V_x^T f of generalized forces (M, N, n_rows): the part of each row inside the builder's null space."""
-    out, base, every = forces.copy(), builder.tree.base_rows, np.arange(len(samples))
-    for chunk, state, where in _on_device(builder, samples):
-        coupled = [*range(base), *(base + joint for joint in builder.layout(state).coupled_joints)]
-        for part, V in builder.null_space_bases(state, builder.kinematics(chunk)):
-            chosen = every[where][part if isinstance(part, slice) else part.cpu().numpy()]
-            at = np.ix_(np.arange(len(forces)), chosen, coupled)
-            inside = V @ (V.mT @ torch.from_numpy(forces[at]).to(V)[..., None])
-            out[at] = inside[..., 0].cpu().numpy()
-    return out
-
-
-def null_space_components(
-    builder: RowBuilder, state: ContactState, kinematics: ChunkKinematics, vectors: Tensor
-) -> Iterator[Tensor]:
+def null_space_components(builder: RowBuilder, state: ContactState, chunk: Chunk, vectors: Tensor) -> Iterator[Tensor]:
     """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
 
     Joints away from contacts pass unchanged. NaN in place of what joints at rest leave unknown.
     """
-    layout, base = builder.layout(state), builder.tree.base_rows
+    layout = builder.layout(state)
+    base = builder.tree.base_rows
     coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
     uncoupled = [base + joint for joint in layout.uncoupled_joints]
-    resting = builder.coupled_at_rest(layout, kinematics)
-    alone = kinematics.without_rest(vectors, base)[..., uncoupled]
-    vectors = kinematics.without_rest(vectors, base, 0.0)
-    for index, V in builder.null_space_bases(state, kinematics):
+    resting = builder.coupled_at_rest(layout, chunk)
+    alone = chunk.without_rest(vectors, base)[..., uncoupled]
+    vectors = chunk.without_rest(vectors, base, 0.0)
+    for index, V in builder.null_space_bases(state, chunk):
         if resting is not None:
             V = V.clone()
             leave_out_torques(V.permute(1, 2, 0), resting[:, index])
@@ -312,20 +240,102 @@ def null_space_components(
         yield torch.cat([inside, alone[:, index]], dim=2)
 
 
+# --------------------------------------------------------------------------------------------------- series of a log
+
+_Where = slice | np.ndarray
+
+
 @one_thread()
 @torch.no_grad()
+def _series(
+    builder: RowBuilder,
+    samples: Samples,
+    compute: Callable[[Samples, ContactState, _Where], Sequence[Tensor]],
+    size: int = CHUNK,
+) -> list[Array]:
+    """Arrays (..., N, columns) of a log in its order.
+
+    Args:
+        builder: on whose device they are computed.
+        samples: of the log.
+        compute: (..., B, columns) each, of samples of one contact state on that device, and where in the log's order
+            these belong.
+        size: samples of a chunk at most.
+    """
+    out: list[Array] = []
+    for state, index in chunks_by_state(samples, size) if len(samples) else [((False,) * len(builder.contacts), EVERY)]:
+        where = index if isinstance(index, slice) else index.numpy()
+        parts = compute(samples[index].to(builder.device), state, where)
+        out = out or [np.empty((*part.shape[:-2], len(samples), part.shape[-1])) for part in parts]
+        for series, part in zip(out, parts, strict=True):
+            series[..., where, :] = part.cpu().numpy()
+    return out
+
+
+def noise_series(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Array:
+    """Standard deviation of the measured forces of a log in its order by `reading_variance`, (N, n_rows) [N, N m]."""
+
+    def compute(part: Samples, state: ContactState, _: _Where) -> list[Tensor]:
+        return [reading_variance(builder, builder.kinematics(part), state, noise).sqrt()]
+
+    return _series(builder, samples, compute)[0]
+
+
+def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
+    """Measured (N, n_rows) and predicted (M, N, n_rows) forces of a log in its order, `phi` as for `to_columns`.
+
+    Measured ones, S^T tau + J_C^T lambda [N, N m], are NaN where a force that enters was not measured. Sensors are
+    taken as calibrated: of the extras only those of actuators enter.
+    """
+    columns = builder.to_columns(phi)
+    workspace = builder.workspaces.take()
+
+    def compute(part: Samples, state: ContactState, _: _Where) -> list[Tensor]:
+        chunk = builder.dynamics(part, workspace, whole=True)
+        measured = _joint_forces(builder, chunk) + _contact_forces(builder, chunk, state)
+        return [measured, _predicted(builder, chunk, columns)]
+
+    measured, predicted = _series(builder, samples, compute)
+    builder.workspaces.give_back(workspace)
+    return measured, predicted
+
+
+def pressure_series(builder: RowBuilder, samples: Samples, wrenches: Array, least: float) -> Array:
+    """`centre_of_pressure` on the feet of wrenches (M, N, 6) of a log in its order, (M, N, 3) [m]."""
+
+    def compute(part: Samples, state: ContactState, where: _Where) -> list[Tensor]:
+        wrench = torch.from_numpy(wrenches[:, where]).to(part.time)
+        return [_pressure_centres(builder, builder.kinematics(part), state, wrench, least)]
+
+    return _series(builder, samples, compute)[0]
+
+
+def null_space_part(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
+    """V_x V_x^T f of generalized forces (M, N, n_rows): the part of each row inside the builder's null space."""
+    base = builder.tree.base_rows
+
+    def compute(part: Samples, state: ContactState, where: _Where) -> list[Tensor]:
+        f = torch.from_numpy(forces[:, where]).to(part.time, copy=True)
+        coupled = [*range(base), *(base + joint for joint in builder.layout(state).coupled_joints)]
+        for index, V in builder.null_space_bases(state, builder.kinematics(part)):
+            inside = f[:, index]
+            inside[..., coupled] = (V @ (V.mT @ inside[..., coupled, None]))[..., 0]
+            f[:, index] = inside
+        return [f]
+
+    return _series(builder, samples, compute)[0]
+
+
 def at_motors(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
     """Generalized forces of a log in its order, (M, N, n_rows), as the motors of closed loops feel them."""
     if builder.motors.none:
         return forces
-    out = forces.copy()
-    for chunk, _, where in _on_device(builder, samples):
-        part = torch.from_numpy(forces[:, where]).to(chunk.time)
-        out[:, where] = builder.motors.of(builder.tree, builder.kinematics(chunk), part).cpu().numpy()
-    return out
 
+    def compute(part: Samples, state: ContactState, where: _Where) -> list[Tensor]:
+        f = torch.from_numpy(forces[:, where]).to(part.time)
+        return [builder.motors.of(builder.tree, builder.kinematics(part).states, f)]
 
-_CHUNK = 512  # samples: rows are dense here
+    return _series(builder, samples, compute)[0]
 
 
 @dataclass(frozen=True)
@@ -342,8 +352,6 @@ class ProjectedForces:
     noise: Array
 
 
-@one_thread()
-@torch.no_grad()
 def projected_forces(builder: RowBuilder, samples: Samples, phi: torch.Tensor) -> ProjectedForces:
     """The rows of a fit, W^T [K phi, f], mapped back by W (W^T W)^-1, whose span is that of V_x.
 
@@ -352,73 +360,23 @@ def projected_forces(builder: RowBuilder, samples: Samples, phi: torch.Tensor) -
         samples: of one log.
         phi: (M, width), parameters in the builder's columns, extra ones included.
     """
-    shape = len(samples), builder.tree.n_rows
-    measured, noise, predicted = np.empty(shape), np.empty(shape), np.empty((len(phi), *shape))
-    for chunk, state, where in _on_device(builder, samples, _CHUNK):
-        rows, W = builder.rows_by_sample(chunk, state)
+
+    def compute(part: Samples, state: ContactState, _: _Where) -> list[Tensor]:
+        rows, W = builder.rows_by_sample(part, state)
         gram = W.mT @ W
         gram.diagonal(dim1=1, dim2=2)[(W == 0.0).all(1)] = 1.0  # of samples with fewer rows
         back = torch.linalg.solve(gram, W.mT).mT
         forces = back @ torch.cat([rows[..., -1:], rows[..., :-1] @ phi.T], dim=2)
         forces[(W == 0.0).all(2)] = torch.nan
-        measured[where] = forces[..., 0].cpu().numpy()
-        predicted[:, where] = forces[..., 1:].permute(2, 0, 1).cpu().numpy()
-        noise[where] = (back.square().sum(2) * chunk.noise_left).sqrt().cpu().numpy()
+        noise = (back.square().sum(2) * part.noise_left).sqrt()
         if builder.task_weights is not None:
-            noise[where] = np.nan  # rows are white in other units
-    return ProjectedForces(measured, predicted, noise)
+            noise = torch.full_like(noise, torch.nan)  # rows are white in other units
+        return [forces[..., 0], forces[..., 1:].permute(2, 0, 1), noise]
+
+    return ProjectedForces(*_series(builder, samples, compute, _DENSE_CHUNK))
 
 
-class SumsOfSquares:
-    """Sums and sums of squares by row, over the samples in which the row is finite."""
-
-    def __init__(self, rows: int) -> None:
-        self.sum, self.squares, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
-
-    def add(self, x: torch.Tensor, weight: float = 1.0) -> None:
-        """Add samples (N, rows), NaN where unknown, each of which counts as `weight` samples."""
-        values = x.cpu().numpy()
-        known = np.isfinite(values)
-        if not known.all():
-            values = np.where(known, values, 0.0)
-        self.sum += weight * values.sum(0)
-        self.squares += weight * np.einsum("ij,ij->j", values, values)
-        self.count += weight * known.sum(0)
-
-    def add_squares(self, squares: float, count: int) -> None:
-        """Add the sum of squares of one row over `count` samples; their sum stays unknown."""
-        self.squares += squares
-        self.count += count
-
-    def rms(self, rows: slice = slice(None)) -> Array:
-        """Rms row by row, (n_rows,) [N or N m]."""
-        return root_mean(self.squares[rows], self.count[rows])
-
-    def pooled(self, rows: slice) -> float:
-        """Rms over all components of some rows."""
-        count = self.count[rows].sum()
-        return float(np.sqrt(self.squares[rows].sum() / count)) if count else np.nan
-
-    def deviation(self, rows: slice) -> float:
-        """Rms about the mean of each row, over all of them."""
-        known = self.count[rows] > 0
-        count, total = self.count[rows][known], self.sum[rows][known]
-        if not len(count):
-            return np.nan
-        return float(np.sqrt(max((self.squares[rows][known] - total**2 / count).sum(), 0.0) / count.sum()))
-
-    def merge(self, other: SumsOfSquares) -> None:
-        """Add the sums of another."""
-        self.sum += other.sum
-        self.squares += other.squares
-        self.count += other.count
-
-
-def root_mean(squares: Array, count: Array) -> Array:
-    """Square root of a mean, NaN of nothing."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.sqrt(squares / count)
-
+# -------------------------------------------------------------------------------------------------- sums of squares
 
 WHITENED = "projected_residual"
 """The group of the rows of a fit: whitened, and projected so that nothing unmeasured is in them."""
@@ -444,6 +402,8 @@ PRESSURE_GROUP = {PRESSURE: "centre of pressure [m]"}
 """The point where the ground's forces meet the ground, where they carry a tenth of the weight or more."""
 
 _LABELS = ERROR_GROUPS | LIMB_GROUPS | PRESSURE_GROUP
+_BESIDE_ROWS = ("nullspace", WHITENED, PRESSURE)  # groups of one number each, which sums have behind the rows of K
+_VECTORS = ("base_force", "base_moment", *LIMB_GROUPS)  # groups with three axes
 
 LOG_SETS = ("train", "test")
 """Sets of logs that errors are given for."""
@@ -461,46 +421,158 @@ ADVICE = (
 """Advice for parameters that predict worse than the nominal ones."""
 
 _CARRIES = 0.1  # of the weight in the robot's file: with less force on the ground its point says nothing
-_NOISE_SAMPLES = 64  # of a chunk, for the noise of its measured forces
 _CLEARLY = 1.05  # ratio of errors above which one is worse
 _MATTERS = 1e-3  # of the measured rms: smaller differences, as on data without noise, do not count
+
+
+class SumsOfSquares:
+    """Sums and sums of squares over samples in which a number is finite: of the rows of K, then of `_BESIDE_ROWS`."""
+
+    def __init__(self, n_rows: int) -> None:
+        self.sum, self.squares, self.count = np.zeros((3, n_rows + len(_BESIDE_ROWS)))
+
+    def add(self, x: Tensor, group: str = "", weight: float = 1.0) -> None:
+        """Add numbers, NaN where unknown, each of which counts as `weight` of them.
+
+        Args:
+            x: of samples, (N, n_rows); of a group beside the rows of any shape.
+            group: name of that group.
+            weight: of each.
+        """
+        values = x.cpu().numpy()
+        values = values.reshape(-1, 1) if group else values
+        at = [_BESIDE_ROWS.index(group) - len(_BESIDE_ROWS)] if group else slice(-len(_BESIDE_ROWS))
+        known = np.isfinite(values)
+        if not known.all():
+            values = np.where(known, values, 0.0)
+        self.sum[at] += weight * values.sum(0)
+        self.squares[at] += weight * np.einsum("ij,ij->j", values, values)
+        self.count[at] += weight * known.sum(0)
+
+    def add_squares(self, squares: float, count: float) -> None:
+        """Add the sum of squares of so many whitened rows of a fit; their sum stays unknown."""
+        at = _BESIDE_ROWS.index(WHITENED) - len(_BESIDE_ROWS)
+        self.squares[at] += squares
+        self.count[at] += count
+
+    def rms(self, at: Sequence[int]) -> float:
+        """Rms over all of some numbers, NaN of nothing."""
+        count = self.count[at].sum()
+        return float(np.sqrt(self.squares[at].sum() / count)) if count else np.nan
+
+    def deviation(self, at: Sequence[int]) -> float:
+        """Rms of each of some numbers about its mean, over all of them."""
+        known = [number for number in at if self.count[number] > 0]
+        if not known:
+            return np.nan
+        count = self.count[known]
+        variance = (self.squares[known] - self.sum[known] ** 2 / count).sum() / count.sum()
+        return float(np.sqrt(max(variance, 0.0)))
+
+    def merge(self, other: SumsOfSquares) -> None:
+        """Add the sums of another."""
+        self.sum += other.sum
+        self.squares += other.squares
+        self.count += other.count
+
+
+class ForceSums:
+    """Sums of squares of generalized forces or their errors; of the measured ones also what noise of readings adds.
+
+    `contact_forces`: whether one that was not measured enters joint rows, which do not count, and whether a measured
+    one enters rows that do.
+    """
+
+    def __init__(self, n_rows: int) -> None:
+        self.forces = SumsOfSquares(n_rows)
+        self.noise = SumsOfSquares(n_rows)
+        self.contact_forces = np.zeros(2, dtype=bool)
+
+    @classmethod
+    def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
+        """Sums over all parts."""
+        out = cls(len(parts[0].forces.sum) - len(_BESIDE_ROWS))
+        for part in parts:
+            out.forces.merge(part.forces)
+            out.noise.merge(part.noise)
+            out.contact_forces |= part.contact_forces
+        return out
+
+    def add_contact_forces(self, measured: Tensor, torque: Tensor) -> None:
+        """Note those in measured joint rows J_C^T lambda + tau, (B, n), NaN where one is not known."""
+        lost = measured.isnan() & torque.isfinite()
+        known = measured.isfinite() & (measured != torque)
+        self.contact_forces |= [bool(lost.any()), bool(known.any())]
+
+
+def _group_places(robot: Robot) -> dict[str, list[int]]:
+    """Where groups are in `SumsOfSquares`, and their parts: "joint_torque.l_knee", "base_force.x"."""
+    base = robot.base_rows
+    n = robot.n
+    places = {"joint_torque": list(range(base, base + n))}
+    vectors = {"base_force": [0], "base_moment": [3]} if base else {"base_force": [], "base_moment": []}
+    if robot.ft_names:
+        limbs = range(base + n, robot.n_rows, 6)
+        vectors |= {"ft_force": list(limbs), "ft_moment": [first + 3 for first in limbs]}
+    for group, first in vectors.items():
+        places[group] = [row + axis for row in first for axis in range(3)]
+    places |= {group: [number - len(_BESIDE_ROWS)] for number, group in enumerate(_BESIDE_ROWS)}
+    places |= {f"joint_torque.{name}": [base + joint] for joint, name in enumerate(robot.joint_names)}
+    for group, first in vectors.items():
+        places |= {f"{group}.{axis}": [row + k for row in first] for k, axis in enumerate("xyz") if first}
+    return places
+
+
+def _all_rms(sums: SumsOfSquares, places: Mapping[str, list[int]]) -> dict[str, float]:
+    """Rms of all groups and parts; of joint torques the mean over joints of theirs."""
+    rms = {name: sums.rms(at) for name, at in places.items()}
+    joints = [x for name, x in rms.items() if name.startswith("joint_torque.") and np.isfinite(x)]
+    return rms | {"joint_torque": float(np.mean(joints)) if joints else np.nan}
 
 
 @dataclass(frozen=True, repr=False)
 class Metrics:
     """Errors of one parameter vector on some logs; None where the logs cannot give a figure.
 
-    `rms` and `relative` by group of `ERROR_GROUPS`, the last in units of the stated noise, `rms` also of `PRESSURE`
-    where contact forces are measured and carry a tenth of the weight; `by_joint_rms` and
-    `by_joint_relative` by joint. Relative means rms of the error over
-    rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
-    the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
-    mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs.
-    `by_axis_rms` and `by_axis_relative` of forces and moments by group and axis: of the base link, or of a sensor's
-    frame, all sensors in limbs together. `noise`, by group, is the rms that the stated noise of the readings leaves
-    after the filter, which no model predicts; None where it is not known. `limbs_in_air`: joint torques are those of
-    limbs in the air alone, as no contact force was measured.
+    Attributes:
+        rms: by group of `ERROR_GROUPS`, of `LIMB_GROUPS` for a robot with such sensors, and of `PRESSURE` where contact
+            forces are measured and carry a tenth of the weight. That of "joint_torque" is the mean over joints of their
+            rms; the whitened one is in units of the stated noise.
+        relative: over rms of what was measured, by the same groups.
+        part_rms: of the joints and axes of groups, "joint_torque.l_knee", "base_force.x": axes of the base link, or of
+            a sensor's frame, all sensors in limbs together.
+        part_relative: over rms of what was measured, by the same joints and axes.
+        base_force_of_variation: relative to the rms of the measured base force about its mean, which is mostly weight.
+        noise: by group, the rms that the stated noise of the readings leaves after the filter, which no model predicts;
+            None where it is not known.
+        limbs_in_air: whether joint torques are those of limbs in the air alone, as no contact force was measured.
     """
 
     rms: dict[str, float | None]
     relative: dict[str, float | None]
-    by_joint_rms: dict[str, float | None]
-    by_joint_relative: dict[str, float | None]
+    part_rms: dict[str, float | None]
+    part_relative: dict[str, float | None]
     base_force_of_variation: float | None
-    limb_rms: dict[str, float | None] = field(default_factory=dict)
-    limb_relative: dict[str, float | None] = field(default_factory=dict)
-    by_axis_rms: dict[str, dict[str, float | None]] = field(default_factory=dict)
-    by_axis_relative: dict[str, dict[str, float | None]] = field(default_factory=dict)
     noise: dict[str, float | None] = field(default_factory=dict)
     limbs_in_air: bool = False
 
     def rms_of(self, group: str) -> float | None:
-        """Rms error of a group of `ERROR_GROUPS` or `LIMB_GROUPS`."""
-        return self.rms.get(group, self.limb_rms.get(group))
+        """Rms error of a group, None where it is not known."""
+        return self.rms.get(group)
 
     def relative_of(self, group: str) -> float | None:
         """The same, over the rms of what was measured."""
-        return self.relative.get(group, self.limb_relative.get(group))
+        return self.relative.get(group)
+
+    @property
+    def by_joint_rms(self) -> dict[str, float | None]:
+        """Rms of the joint torques by name of the joint."""
+        return _parts_of(self.part_rms, "joint_torque")
+
+    @property
+    def by_joint_relative(self) -> dict[str, float | None]:
+        """The same, over the rms of what was measured."""
+        return _parts_of(self.part_relative, "joint_torque")
 
     def label(self, group: str) -> str:
         """Name and unit of such a group, and what it is limited to."""
@@ -510,7 +582,8 @@ class Metrics:
     def __repr__(self) -> str:
         said = []
         for group in ERROR_GROUPS:
-            rms, share = self.rms.get(group), self.relative.get(group)
+            rms = self.rms.get(group)
+            share = self.relative.get(group)
             if rms is not None:
                 name, _, unit = self.label(group).rstrip("]").partition(" [")
                 said.append(f"{name} {rms:.3g} {unit}" + ("" if share is None else f" ({format_percent(share)} %)"))
@@ -519,18 +592,23 @@ class Metrics:
     def as_dict(self) -> dict[str, object]:
         """As `metrics.json` has it."""
         out: dict[str, object] = {}
-        for suffix, groups, joints, limbs, axes in (
-            ("rms", self.rms, self.by_joint_rms, self.limb_rms, self.by_axis_rms),
-            ("rms_relative", self.relative, self.by_joint_relative, self.limb_relative, self.by_axis_relative),
-        ):
-            out |= {f"{group}_{suffix}": x for group, x in limbs.items()}
-            out |= {f"{group}_{suffix.replace('rms', 'rms_by_axis')}": x for group, x in axes.items()}
+        for suffix, groups, parts in (("", self.rms, self.part_rms), ("_relative", self.relative, self.part_relative)):
+            for group in LIMB_GROUPS:
+                if group in groups:
+                    out[f"{group}_rms{suffix}"] = groups[group]
+            for group in _VECTORS:
+                if axes := _parts_of(parts, group):
+                    out[f"{group}_rms_by_axis{suffix}"] = axes
             for group in ROW_GROUPS:
-                out[f"{group}_{suffix}"] = groups[group]
-                if group == "joint_torque":
-                    out[f"joint_torque_{suffix.replace('rms', 'rms_by_joint')}"] = joints
+                out[f"{group}_rms{suffix}"] = groups[group]
+            out[f"joint_torque_rms_by_joint{suffix}"] = _parts_of(parts, "joint_torque")
         out[f"{PRESSURE}_rms"] = self.rms.get(PRESSURE)
         return out | {WHITENED: self.rms.get(WHITENED), f"{WHITENED}_relative": self.relative.get(WHITENED)}
+
+
+def _parts_of(parts: Mapping[str, float | None], group: str) -> dict[str, float | None]:
+    """Those of a group by the name of the joint or axis."""
+    return {name.removeprefix(f"{group}."): x for name, x in parts.items() if name.startswith(f"{group}.")}
 
 
 class Evaluation:
@@ -549,7 +627,8 @@ class Evaluation:
         `noise`: standard deviations of readings as recorded, NaN where unknown, to compare errors with.
         """
         actuators = replace(terms or ExtraTerms(), offsets={}, scales={})
-        self.robot, self.noise = robot, noise
+        self.robot = robot
+        self.noise = noise
         sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
         self.builder = RowBuilder(robot, contacts, sensors, actuators).to(device)
 
@@ -570,87 +649,90 @@ class Evaluation:
         self, logs: Sequence[Samples], phi: Mapping[int, Array], progress: ProgressCallback | None = None
     ) -> list[ForceSums]:
         """Sums of squares of the measured forces, then of the errors of each row of `phi` (M, 12 L) of a log's fold."""
-        builder, base = self.builder, self.robot.base_rows
-        columns = {fold: builder.to_columns(own) for fold, own in phi.items()}
-        count, joints = 1 + len(next(iter(phi.values()))), slice(base, base + self.robot.n)
+        columns = {fold: self.builder.to_columns(values) for fold, values in phi.items()}
+        count = 1 + len(next(iter(phi.values())))
 
         def sum_chunks(chunks: Iterator[tuple[Samples, ContactState]]) -> list[ForceSums]:
             sums = [ForceSums(self.robot.n_rows) for _ in range(count)]
-            workspace = builder.workspaces.take()
+            workspace = self.builder.workspaces.take()
             for samples, state in chunks:
-                kinematics = builder.dynamics(samples, workspace, whole=True)
-                forces = measured_and_predicted_forces(builder, samples, state, columns, kinematics)
-                sums[0].add_contact_forces(forces.measured[:, joints], forces.torque[:, joints])
-                errors = torch.cat([-forces.measured[None], forces.predicted - forces.measured])
-                errors = kinematics.without_rest(errors, base)
-                for total, error in zip(sums, builder.motors.of(builder.tree, kinematics, errors), strict=True):
-                    total.rows.add(error)
-                if base:
-                    wrench = torch.cat([forces.measured[None], forces.predicted])[..., :base]
-                    at = pressure_centres(builder, samples, state, kinematics, wrench, self.least_carried)
-                    for total, off in zip(sums[1:], torch.linalg.vector_norm(at[1:] - at[0], dim=-1), strict=True):
-                        total.pressure.add(off[:, None])
-                vectors = torch.cat([forces.torque[None], forces.predicted - forces.torque])
-                if self.noise is not None:
-                    sums[0].noise.merge(self._noise_sums(samples, state, kinematics, self.noise))
-                for group in null_space_components(builder, state, kinematics, vectors):
-                    for total, inside in zip(sums, group, strict=True):
-                        total.projected.add(inside.flatten()[:, None])
-            builder.workspaces.give_back(workspace)
+                self._add(sums, self.builder.dynamics(samples, workspace, whole=True), state, columns)
+            self.builder.workspaces.give_back(workspace)
             return sums
 
         loaded = [replace(log, unloaded=None) for log in logs]
-        parts = map_chunks(loaded, builder, sum_chunks, progress=progress)
+        parts = map_chunks(loaded, self.builder, sum_chunks, progress=progress)
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
 
-    def _noise_sums(
-        self, samples: Samples, state: ContactState, kinematics: ChunkKinematics, noise: SensorNoise
-    ) -> SumsOfSquares:
-        """Sums of the variances of the measured forces, from some samples of a chunk: they hardly change."""
-        sums, step = SumsOfSquares(self.robot.n_rows), -(-len(samples) // _NOISE_SAMPLES)
-        part = samples.every(step)
-        variance = reading_variance(self.builder, part, state, kinematics.select(slice(None, None, step)), noise)
-        sums.add(variance.sqrt(), len(samples) / len(part))
-        return sums
+    def _add(self, sums: Sequence[ForceSums], chunk: Chunk, state: ContactState, phi: Mapping[int, Tensor]) -> None:
+        """Add a chunk to the sums of the measured forces and of the errors at parameters by fold."""
+        builder = self.builder
+        base = self.robot.base_rows
+        joints = slice(base, base + self.robot.n)
+        torque = _joint_forces(builder, chunk)
+        measured = torque + _contact_forces(builder, chunk, state)
+        predicted = _predicted_by_fold(builder, chunk, phi)
+        sums[0].add_contact_forces(measured[:, joints], torque[:, joints])
+        errors = torch.cat([-measured[None], predicted - measured])
+        errors = builder.motors.of(builder.tree, chunk.states, chunk.without_rest(errors, base))
+        for total, error in zip(sums, errors, strict=True):
+            total.forces.add(error)
+        if base:
+            wrench = torch.cat([measured[None], predicted])[..., :base]
+            points = _pressure_centres(builder, chunk, state, wrench, self.least_carried)
+            for total, distance in zip(sums[1:], torch.linalg.vector_norm(points[1:] - points[0], dim=-1), strict=True):
+                total.forces.add(distance, PRESSURE)
+        for inside in null_space_components(builder, state, chunk, torch.cat([torque[None], predicted - torque])):
+            for total, part in zip(sums, inside, strict=True):
+                total.forces.add(part, "nullspace")
+        if self.noise is not None:  # of some samples: it hardly changes
+            thinned = chunk.select(slice(None, None, -(-len(chunk) // _NOISE_SAMPLES)))
+            variance = reading_variance(builder, thinned, state, self.noise)
+            sums[0].noise.add(variance.sqrt(), weight=len(chunk) / len(thinned))
 
     def summarize(self, measured: ForceSums, errors: ForceSums) -> Metrics:
         """Metrics from sums of squares."""
-        base, n = self.robot.base_rows, self.robot.n
-        rms, size = errors.rms(base, n), measured.rms(base, n)
-        pressure = finite_or_none(errors.pressure.pooled(slice(None)))
-        joints = slice(base, base + n)
-        by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
-        groups = ERROR_GROUPS if errors.whitened.count.any() else ROW_GROUPS
-        names, limbs = self.robot.joint_names, LIMB_GROUPS if self.robot.ft_names else {}
-        axes, axis_size = errors.rows_by_axis(base, n), measured.rows_by_axis(base, n)
+        places = _group_places(self.robot)
+        rms = _all_rms(errors.forces, places)
+        size = _all_rms(measured.forces, places)
+        noise = _all_rms(measured.noise, places)
+        parts = [name for name in places if "." in name]
+        groups = [*ROW_GROUPS, *(group for group in LIMB_GROUPS if group in places)]
+        if np.isfinite(rms[WHITENED]):
+            groups.insert(len(ROW_GROUPS), WHITENED)
+        pressure = finite_or_none(rms[PRESSURE])
+        variation = measured.forces.deviation(places["base_force"])
+        with_noise = ("joint_torque", "base_force", "base_moment", WHITENED)
         return Metrics(
-            {group: finite_or_none(rms[group]) for group in groups} | ({PRESSURE: pressure} if pressure else {}),
-            {group: _ratio(rms[group], size[group]) for group in groups},
-            {name: finite_or_none(x) for name, x in zip(names, by_joint, strict=True)},
-            {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
-            _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),
-            {group: finite_or_none(rms[group]) for group in limbs},
-            {group: _ratio(rms[group], size[group]) for group in limbs},
-            {group: dict(zip("xyz", map(finite_or_none, x), strict=True)) for group, x in axes.items()},
-            {group: dict(zip("xyz", map(_ratio, x, axis_size[group]), strict=True)) for group, x in axes.items()},
-            {} if self.noise is None else measured.noise_rms(base, n),
-            bool(measured.contact_forces[0] and not measured.contact_forces[1]),
+            rms={group: finite_or_none(rms[group]) for group in groups} | ({PRESSURE: pressure} if pressure else {}),
+            relative={group: _ratio(rms[group], size[group]) for group in groups},
+            part_rms={part: finite_or_none(rms[part]) for part in parts},
+            part_relative={part: _ratio(rms[part], size[part]) for part in parts},
+            base_force_of_variation=_ratio(rms["base_force"], variation),
+            noise={} if self.noise is None else {group: finite_or_none(noise[group]) for group in with_noise},
+            limbs_in_air=bool(measured.contact_forces[0] and not measured.contact_forces[1]),
         )
+
+
+# ------------------------------------------------------------------------------------- beside the nominal parameters
 
 
 def compare_parts(nominal: Metrics, identified: Metrics) -> tuple[int, int, list[str]]:
     """Of joints and axes of the base: how many are predicted better, of how many, and those that are clearly worse."""
-    pairs = {
-        name: (before, identified.by_joint_rms.get(name), identified.by_joint_relative.get(name))
-        for name, before in nominal.by_joint_rms.items()
-    }
-    for group in ("base_force", "base_moment"):
-        after, share = identified.by_axis_rms.get(group, {}), identified.by_axis_relative.get(group, {})
-        for axis, before in nominal.by_axis_rms.get(group, {}).items():
-            pairs[f"{group_name(group)} {axis}"] = before, after.get(axis), share.get(axis)
-    known = {name: (x, y, share) for name, (x, y, share) in pairs.items() if x is not None and y is not None}
-    worse = [f"{name} ({y / x:.2g} times)" for name, (x, y, share) in known.items() if x and _is_worse(x, y, share)]
-    return sum(y < x for x, y, _ in known.values()), len(known), worse
+    better = 0
+    known = 0
+    worse = []
+    for part, before in nominal.part_rms.items():
+        group, _, name = part.partition(".")
+        after = identified.part_rms.get(part)
+        if group in LIMB_GROUPS or before is None or after is None:
+            continue
+        known += 1
+        better += after < before
+        if before and _is_worse(before, after, identified.part_relative.get(part)):
+            named = name if group == "joint_torque" else f"{group_name(group)} {name}"
+            worse.append(f"{named} ({after / before:.2g} times)")
+    return better, known, worse
 
 
 def _is_worse(before: float, after: float, share: float | None) -> bool:
@@ -663,7 +745,8 @@ def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Wors
     worse = []
     for logs, (nominal, identified) in sets.items():
         for group in DECISIVE_GROUPS:
-            before, after = nominal.rms_of(group), identified.rms_of(group)
+            before = nominal.rms_of(group)
+            after = identified.rms_of(group)
             if before is None or after is None:
                 continue
             if _is_worse(before, after, identified.relative_of(group)):
@@ -708,75 +791,6 @@ def describe_errors(group: str, identified: float | None, nominal: float | None)
 def group_name(group: str) -> str:
     """Name of a group of rows, without its unit."""
     return _LABELS[group].split(" [")[0]
-
-
-class ForceSums:
-    """Sums of squares of generalized forces or their errors: of rows, and inside the contacts' null space.
-
-    `whitened`: of the rows of a fit, V_x^T f of its sensors in units of their noise. `noise` of rows: what the noise of
-    readings adds to the measured forces; `whitened_noise`: to the rows of a fit. `pressure`: distances of centres of
-    pressure. `contact_forces`: whether one
-    that was not measured enters joint rows, which do not count, and whether a measured one enters rows that do.
-    """
-
-    def __init__(self, n_rows: int) -> None:
-        self.rows, self.projected, self.whitened = SumsOfSquares(n_rows), SumsOfSquares(1), SumsOfSquares(1)
-        self.noise, self.whitened_noise = SumsOfSquares(n_rows), SumsOfSquares(1)
-        self.pressure = SumsOfSquares(1)
-        self.contact_forces = np.zeros(2, dtype=bool)
-
-    @classmethod
-    def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
-        """Sums over all parts."""
-        out = cls(len(parts[0].rows.squares))
-        for part in parts:
-            for name in ("rows", "projected", "whitened", "noise", "whitened_noise", "pressure"):
-                getattr(out, name).merge(getattr(part, name))
-            out.contact_forces |= part.contact_forces
-        return out
-
-    def add_contact_forces(self, measured: torch.Tensor, torque: torch.Tensor) -> None:
-        """Note those in measured joint rows J_C^T lambda + tau, (B, n), NaN where one is not known."""
-        lost, known = measured.isnan() & torque.isfinite(), measured.isfinite() & (measured != torque)
-        self.contact_forces |= [bool(lost.any()), bool(known.any())]
-
-    def noise_rms(self, base_rows: int, n: int) -> dict[str, float | None]:
-        """Rms of the noise by group of rows, as `rms`; None where it is not known."""
-        by_group = _by_group(self.noise, base_rows, n) | {WHITENED: self.whitened_noise.pooled(slice(None))}
-        return {group: finite_or_none(x) for group, x in by_group.items()}
-
-    def rms(self, base_rows: int, n: int) -> dict[str, float]:
-        """Rms by group of rows, NaN for an empty group, of a robot with `base_rows` and n joints."""
-        squares, count = self._in_limbs(base_rows + n)
-        force, moment = root_mean(squares.sum(1), count.sum(1))
-        return _by_group(self.rows, base_rows, n) | {
-            "ft_force": float(force),
-            "ft_moment": float(moment),
-            "nullspace": self.projected.pooled(slice(None)),
-            WHITENED: self.whitened.pooled(slice(None)),
-        }
-
-    def rows_by_axis(self, base_rows: int, n: int) -> dict[str, Array]:
-        """Rms of forces and moments of the base, and of force/torque sensors in limbs, (3,) by group of rows."""
-        out = dict(zip(("base_force", "base_moment"), self.rows.rms(slice(0, base_rows)).reshape(-1, 3), strict=False))
-        squares, count = self._in_limbs(base_rows + n)
-        if len(self.rows.count) > base_rows + n:
-            out |= dict(zip(LIMB_GROUPS, root_mean(squares, count), strict=True))
-        return out
-
-    def _in_limbs(self, first: int) -> tuple[Array, Array]:
-        """Squares and their number, (2, 3): forces and moments by axis, of all force/torque sensors in limbs."""
-        squares, count = (x[first:].reshape(-1, 2, 3).sum(0) for x in (self.rows.squares, self.rows.count))
-        return squares, count
-
-
-def _by_group(sums: SumsOfSquares, base_rows: int, n: int) -> dict[str, float]:
-    joints = sums.rms(slice(base_rows, base_rows + n))
-    return {
-        "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
-        "base_force": sums.pooled(slice(0, 3)) if base_rows else np.nan,
-        "base_moment": sums.pooled(slice(3, 6)) if base_rows else np.nan,
-    }
 
 
 def finite_or_none(x: float) -> float | None:

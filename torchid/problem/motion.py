@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,16 +14,16 @@ from torch import Tensor
 from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
 from torchid.logs.log import POINTS, SignalNoise
-from torchid.parameters import GRAVITY, Array
+from torchid.parameters import Array
 from torchid.regressor import motion_from_state
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
-if TYPE_CHECKING:
-    from torchid.problem.samples import Samples
-    from torchid.sensing import SensorNoise
-
+MIN_MOTION = 0.01
+"""Travel [rad or m] up to which a joint stands still."""
+MIN_TURN_DEG = 1.0
+"""Turn [degrees] from which on a base moves."""
 
 _POSE_FIELDS = (
     "base_quat_xyzw",
@@ -229,53 +227,32 @@ class MotionNoise:
     base: Tensor
     turns_force: bool = False
 
-    def perturbed(self, samples: Samples, size: Tensor) -> Samples:
-        """Samples with as much noise of the motion again, times a `size`, (B, 1).
+    def drawn(self, time: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+        """Noise of joints, (3, B, n), and of the base, (B, 12), at time stamps (B,), times a `size`, (B, 1).
 
         Each of some independent sources has one standard deviation, to one side or the other, which is drawn by the
         time stamp: samples get the same noise wherever they are.
         """
         count = self.joints.shape[0]
-        side = size * _sides(samples.time, 3 * count + len(self.base))
+        side = size * random_sides(time, 3 * count + len(self.base))
         joints, base = self.joints.to(side), self.base.to(side)
-        q, v, a = torch.einsum("jkl,bjl->kbj", joints, side[:, : 3 * count].unflatten(1, (count, 3)))
-        off = side[:, 3 * count :] @ base.T
-        motion, angle = samples.base, off[:, _ANGLE]
-        force = motion.specific_force
+        of_joints = torch.einsum("jkl,bjl->kbj", joints, side[:, : 3 * count].unflatten(1, (count, 3)))
+        return of_joints, side[:, 3 * count :] @ base.T
+
+    def added_to(self, base: BaseMotion, noise: Tensor) -> BaseMotion:
+        """The motion of a base with noise (B, 12) added."""
+        angle, omega, alpha, at_force = noise.split(3, dim=1)
+        force = base.specific_force
         if force is not None and self.turns_force:
             turn = torch.linalg.cross(angle, force)
             force = force - turn + 0.5 * torch.linalg.cross(angle, turn)
-        moved = replace(
-            motion,
-            quat_xyzw=None if motion.quat_xyzw is None else _turned(motion.quat_xyzw, angle),
-            specific_force=None if force is None else force + off[:, _FORCE],
-            angular_velocity=_plus(motion.angular_velocity, off[:, _OMEGA]),
-            angular_acceleration=_plus(motion.angular_acceleration, off[:, _ALPHA]),
-        )
         return replace(
-            samples,
-            joint_position=samples.joint_position + q,
-            joint_velocity=samples.joint_velocity + v,
-            joint_acceleration=samples.joint_acceleration + a,
-            base=moved,
+            base,
+            quat_xyzw=None if base.quat_xyzw is None else _turned(base.quat_xyzw, angle),
+            specific_force=_plus(force, at_force),
+            angular_velocity=_plus(base.angular_velocity, omega),
+            angular_acceleration=_plus(base.angular_acceleration, alpha),
         )
-
-
-def with_noise_alone(samples: Samples, noise: SensorNoise) -> Samples:
-    """Samples whose readings are noise alone, one standard deviation to one side or the other, drawn as above.
-
-    Args:
-        samples: B of one log.
-        noise: of the forces.
-    """
-    torque, wrench, time = samples.torque, samples.wrench, samples.time
-    if torque is not None:
-        std = torque.new_tensor(noise.dof_std(samples.joint_position.shape[1], torque.shape[1]))
-        torque = 0.0 * torque + std * _sides(time, len(std))
-    if wrench is not None:
-        sides = _sides(time, wrench.shape[1] * 6).unflatten(1, (-1, 6))
-        wrench = 0.0 * wrench + wrench.new_tensor(noise.wrench_std) * sides
-    return replace(samples, torque=torque, wrench=wrench)
 
 
 def bind_motion_noise(
@@ -321,8 +298,8 @@ def _chain(std: Mapping[str, Array], names: Sequence[str], derivatives: Array, c
     out = np.zeros((count, 3, 3))
     recorded = [index for index, name in enumerate(names) if name in std]
     for first, after in pairwise([*recorded, len(names)]):
-        own = derivatives[: after - first, : after - first]
-        out[:, first:after, first:after] = np.square(std[names[first]])[:, None, None] * own
+        covariance = derivatives[: after - first, : after - first]
+        out[:, first:after, first:after] = np.square(std[names[first]])[:, None, None] * covariance
     return out
 
 
@@ -347,7 +324,7 @@ def _square_root(covariance: Array) -> Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :] @ np.swapaxes(vectors, -1, -2))
 
 
-def _sides(time: Tensor, count: int) -> Tensor:
+def random_sides(time: Tensor, count: int) -> Tensor:
     """+1 or -1 for each sample and source, (B, count), drawn by the samples' stamps (B,), at random to all appearances.
 
     Source: splitmix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
@@ -381,35 +358,3 @@ def _turned(quat_xyzw: Tensor, angle: Tensor) -> Tensor:
 
 def _plus(x: Tensor | None, off: Tensor) -> Tensor | None:
     return None if x is None else x + off
-
-
-MIN_MOTION = 0.01
-"""Travel [rad or m] up to which a joint stands still."""
-MIN_TURN_DEG = 1.0
-"""Turn [degrees] from which on a base moves."""
-_MIN_ACCELERATION = 0.1 * GRAVITY  # [m/s^2] rms, of a base that is shaken; noise of a pose in half a millimetre: 0.4
-_MOST_SAMPLES = 5_000  # evenly spaced
-
-
-def is_at_rest(logs: Sequence[Samples]) -> bool:
-    """Whether in none of some logs a joint or the base moves; not so without any log.
-
-    Forces at rest tell what balances gravity, no inertia and no friction.
-    """
-    return bool(logs) and not any(_moves(log) for log in logs)
-
-
-def _moves(log: Samples) -> bool:
-    """Whether a joint of a filtered log travels, or its base turns or is shaken."""
-    thin = log.every(max(1, len(log) // _MOST_SAMPLES))
-    position, base = thin.joint_position, thin.base
-    if position.shape[1] and float((position.amax(dim=0) - position.amin(dim=0)).max()) > MIN_MOTION:
-        return True
-    if base.quat_xyzw is not None:
-        cosine = (base.quat_xyzw @ base.quat_xyzw[0]).abs().clamp(max=1.0)
-        if float(2.0 * torch.arccos(cosine).max()) > math.radians(MIN_TURN_DEG):
-            return True
-    force = base.specific_force
-    if force is None:
-        return False
-    return float((force - force.mean(dim=0)).square().sum(dim=1).mean().sqrt()) > _MIN_ACCELERATION

@@ -27,7 +27,6 @@ from torchid.parameters import Array
 from torchid.problem.chunks import blocks_in, chunk_size, join_pieces, map_chunks, span_of_samples
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor, gram_matrix
-from torchid.problem.motion import with_noise_alone
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.rounding import RANK_TOLERANCE, column_scale, is_significant
@@ -177,7 +176,7 @@ def _noise_gram_of_chunks(
     for samples, state in chunks:
         spans = PartKey.spans(samples, state)
         if scales:
-            alone = with_noise_alone(samples, builder.sensors.noise)
+            alone = samples.with_noise_alone(builder.sensors.noise)
             for rows, index in builder.blocks(alone, state, workspace):
                 for key, start, end in spans:
                     first, last = span_of_samples(index, start, end)
@@ -188,7 +187,8 @@ def _noise_gram_of_chunks(
         if noise is None:
             continue
         at, side = _copies([(start, end) for _, start, end in spans])
-        perturbed = noise.perturbed(samples[at.to(samples.time.device)], side.to(samples.time)[:, None])
+        repeated = samples[at.to(samples.time.device)]
+        perturbed = repeated.perturbed(noise, side.to(samples.time)[:, None])
         for rows, index in builder.blocks(perturbed, state, workspace):
             for key, start, end in spans:
                 sums, second = out.setdefault(key, {}), 2 * start + end
@@ -258,14 +258,14 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
     whitening = scale[:, None] * Vh[kept].T / values[kept]  # rows @ whitening has orthonormal columns
     noise = whitening.T @ noise_gram[:-1, :-1] @ whitening
     shares, turn = np.linalg.eigh(0.5 * (noise + noise.T))
-    along, of_forces, rest = (
+    along, of_forces, beyond = (
         turn.T @ (U[:, kept].T @ rhs),
         turn.T @ (whitening.T @ noise_gram[:-1, -1]),
         U[:, other].T @ rhs,
     )
     of_noise = np.square(along) @ np.minimum(shares, 1.0) - 2.0 * along @ of_forces + noise_gram[-1, -1]
-    spent = min((len(along) + len(rest)) / max(factor.independent_rows, 1.0), 1.0)
-    residual = np.square(rhs - U[:, kept] @ (turn @ along) - U[:, other] @ rest).sum()
+    spent = min((len(along) + len(beyond)) / max(factor.independent_rows, 1.0), 1.0)
+    residual = np.square(rhs - U[:, kept] @ (turn @ along) - U[:, other] @ beyond).sum()
     possible = min(residual / ((1.0 - spent) * of_noise), 1.0) if spent < 1.0 and of_noise > 0.0 else 1.0
     shares, of_forces = possible * shares, possible * of_forces
     scales = [column for column, size in prior.reading_noise.items() if size > 0.0]
@@ -274,24 +274,24 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
     shares, of_forces = bound * shares, bound * of_forces
     if np.abs(shares).max(initial=0.0) < _NEGLIGIBLE:
         return CorrectedTriangle(R, NoiseShares.of(shares))
-    left = np.clip(1.0 - shares, LEAST_SIGNAL, _MOST_SIGNAL)
+    remaining_share = np.clip(1.0 - shares, LEAST_SIGNAL, _MOST_SIGNAL)
     combinations = turn.T @ (values[kept, None] * Vh[kept] * size)
     target = along - of_forces
-    remaining = ((shares > 1.0 - LEAST_SIGNAL) & (bound == 1.0)) * (left - np.maximum(1.0 - shares, 0.0))
+    remaining = ((shares > 1.0 - LEAST_SIGNAL) & (bound == 1.0)) * (remaining_share - np.maximum(1.0 - shares, 0.0))
     target += remaining * (combinations[:, : len(prior.nominal)] @ prior.nominal)
-    best = whitening @ (turn @ (target / left))
-    residual = np.linalg.norm(rhs - rows @ best - U[:, other] @ rest)
+    best = whitening @ (turn @ (target / remaining_share))
+    residual = np.linalg.norm(rhs - rows @ best - U[:, other] @ beyond)
     stacked = [
-        np.column_stack([np.sqrt(left)[:, None] * combinations, target / np.sqrt(left)]),
-        np.column_stack([values[other, None] * Vh[other] * size, rest]),
+        np.column_stack([np.sqrt(remaining_share)[:, None] * combinations, target / np.sqrt(remaining_share)]),
+        np.column_stack([values[other, None] * Vh[other] * size, beyond]),
         np.append(np.zeros_like(size), residual)[None],
-        np.zeros((len(R) - 1 - len(target) - len(rest), R.shape[1])),
+        np.zeros((len(R) - 1 - len(target) - len(beyond), R.shape[1])),
     ]
     noise, triangle = NoiseShares.of(shares + lacking), np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
     if not noise.lost:
         return CorrectedTriangle(triangle, noise)
     deviations = np.where(np.isin(range(len(best)), scales), np.maximum(np.abs(1.0 + best), 1.0), best)
-    shrinkage, count = ((remaining + lacking) / left)[:, None] * combinations, len(prior.nominal)
+    shrinkage, count = ((remaining + lacking) / remaining_share)[:, None] * combinations, len(prior.nominal)
     units = np.hstack([shrinkage[:, :count] @ prior.spread, shrinkage[:, count:] * deviations[count:]])
     return CorrectedTriangle(triangle, noise, whitening @ turn @ units)
 

@@ -89,12 +89,14 @@ class ColumnLevels:
     @classmethod
     def of(cls, R: Array) -> ColumnLevels:
         """Levels of the columns of rows (M, n), all finite."""
-        n, size = R.shape[1], np.linalg.norm(R, axis=0)
+        n = R.shape[1]
+        size = np.linalg.norm(R, axis=0)
         size[size == 0.0] = 1.0
         pivoted, order = scipy.linalg.qr(R / size, mode="r", pivoting=True)
         pivots = np.zeros(n)
         pivots[: len(pivoted)] = np.abs(np.diag(pivoted))
-        T, bounds = np.eye(n), [*_level_starts(pivots), n]
+        T = np.eye(n)
+        bounds = [*_level_starts(pivots), n]
         for start, end in zip(bounds[1:-1], bounds[2:], strict=True):
             combination = scipy.linalg.solve_triangular(pivoted[:start, :start], pivoted[:start, start:end])
             T[np.ix_(order[:start], order[start:end])] = -combination
@@ -117,7 +119,9 @@ class ColumnLevels:
             first: number of rows that are no part of it.
             write_gram: changes them and multiplies.
         """
-        gram, squares, before = np.empty_like(self.T_unit), np.empty(len(self.lower)), columns[self.lower, first:]
+        gram = np.empty_like(self.T_unit)
+        squares = np.empty(len(self.lower))
+        before = columns[self.lower, first:]
         write_gram(columns, first, self.lower, self.to_lower, squares, gram)
         if self.are_of(gram, squares):
             return gram
@@ -143,10 +147,12 @@ class ColumnLevels:
         """R T^-1, (n, n), of which only the lower columns differ from R's."""
         if not len(self.lower):
             return R
-        upper, unit = np.delete(np.arange(len(self.size)), self.lower), R / self.size
-        own, others = self.T_unit[np.ix_(self.lower, self.lower)], self.T_unit[np.ix_(upper, self.lower)]
+        upper = np.delete(np.arange(len(self.size)), self.lower)
+        unit = R / self.size
+        within = self.T_unit[np.ix_(self.lower, self.lower)]
+        above = self.T_unit[np.ix_(upper, self.lower)]
         with np.errstate(invalid="ignore"):  # what is not finite stays so
-            unit[:, self.lower] = np.linalg.solve(own.T, (unit[:, self.lower] - unit[:, upper] @ others).T).T
+            unit[:, self.lower] = np.linalg.solve(within.T, (unit[:, self.lower] - unit[:, upper] @ above).T).T
         return np.asarray(unit * self.size)
 
 
@@ -173,12 +179,13 @@ class _Sum:
     checked: Array | None = None
 
     @classmethod
-    def of_nothing(cls, levels: ColumnLevels) -> _Sum:
+    def zeros(cls, levels: ColumnLevels) -> _Sum:
         return cls(levels, np.zeros_like(levels.T_unit))
 
     def add(self, gram: Array) -> bool:
         """Add the Gram matrix of rows in combined columns, if the sum may be used; returns whether it was."""
-        total, lower = self.gram + gram, self.levels.lower
+        total = self.gram + gram
+        lower = self.levels.lower
         total[lower, lower] += _FLOOR**2 * self.levels.squares_before(gram)
         if not self._is_certain(total):
             return False
@@ -196,7 +203,8 @@ class _Sum:
         _, unit = _unit_columns(total)
         for least in _CERTIFIED:
             if _is_positive(unit - np.diag(np.full(len(unit), least))):
-                self.least, self.checked = least, diagonal.copy()
+                self.least = least
+                self.checked = diagonal.copy()
                 return True
         return False
 
@@ -235,7 +243,7 @@ class RowWeighting(Protocol):
 
 
 class RowCompressor:
-    """Adds rows to one triangular factor after the other.
+    """Adds rows to a triangular factor, which has all of them when this is finished.
 
     A Gram matrix takes a third of the time of Householder QR, but squares the condition number, which costs half of the
     digits. Here it is one of combined columns (`ColumnLevels`), whose condition is small whatever that of the rows, and
@@ -243,61 +251,46 @@ class RowCompressor:
     columns then combined anew. Few rows, and all on a GPU and in single precision, are factorized.
     """
 
-    def __init__(self, write_gram: GramWriter = write_gram) -> None:
-        """`write_gram`: NumPy's way, or a compiled one."""
+    def __init__(self, factor: TriangularFactor, write_gram: GramWriter = write_gram) -> None:
+        """Add rows to a factor; `write_gram`: NumPy's way, or a compiled one."""
+        self.factor = factor
         self._write_gram = write_gram
-        self._factor: TriangularFactor | None = None
-        # of this factor alone: it is the same to the last bit, whatever the worker had before
         self._levels: dict[tuple[int, ...], ColumnLevels] = {}
         self._sums: dict[tuple[int, ...], _Sum] = {}
 
-    def add(
-        self, factor: TriangularFactor, support: tuple[int, ...], stacked: Tensor, oversampling: float = 1.0
-    ) -> None:
-        """Add rows with room above them to a factor; what was added to another before is finished.
+    def add(self, support: tuple[int, ...], stacked: Tensor, oversampling: float = 1.0) -> None:
+        """Add rows with room above them.
 
         Args:
-            factor: which has all rows when this is finished.
             support: the columns in which they are not zero.
             stacked: as `TriangularFactor.add_in_place` takes it.
             oversampling: rows per independent row, at least 1.
         """
-        if factor is not self._factor:
-            self.finish()
-            self._factor = factor
         room = stacked.shape[1]
         count = stacked.shape[0] - room
         known = self._sums.get(support)
         least = _ROWS_PER_COLUMN * room if known else max(_LEAST_ROWS, _ROWS_PER_COLUMN * room)
-        if stacked.device.type != "cpu" or stacked.dtype != torch.float64 or count < least:
-            factor.add_in_place(support, stacked, oversampling)
-            return
-        columns = stacked.T.numpy()
-        known = known or self._start(support, columns[:, room:])
+        columns = stacked.T
+        if stacked.device.type == "cpu" and stacked.dtype == torch.float64 and count >= least:
+            known = known or self._start(support, columns[:, room:].numpy())
+        else:
+            known = None
         if known is None:
-            factor.add_in_place(support, stacked, oversampling)
+            self.factor.add_in_place(support, stacked, oversampling)
             return
-        gram = known.levels.apply(columns, room, self._write_gram)
+        gram = known.levels.apply(columns.numpy(), room, self._write_gram)
         if gram is not None and known.add(gram):
             self._sums[support] = known
         else:
-            self._factorize(factor, support, stacked, known, gram is not None)
-        factor.count(count, oversampling)
+            self._factorize(support, stacked, known, gram is not None)
+        self.factor.count(count, oversampling)
 
-    def levels(self, factor: TriangularFactor, support: tuple[int, ...]) -> ColumnLevels | None:
-        """Those in which rows of a block are added to a factor; None before there are any."""
-        known = self._sums.get(support) if factor is self._factor else None
+    def levels(self, support: tuple[int, ...]) -> ColumnLevels | None:
+        """Those in which rows of a block are added; None before there are any."""
+        known = self._sums.get(support)
         return None if known is None else known.levels
 
-    def add_gram(
-        self,
-        factor: TriangularFactor,
-        support: tuple[int, ...],
-        squares: Array,
-        gram: Array,
-        count: int,
-        oversampling: float,
-    ) -> bool:
+    def add_gram(self, support: tuple[int, ...], squares: Array, gram: Array, count: int, oversampling: float) -> bool:
         """Add what `GramWriter` writes of so many rows in the present levels, if it may be used.
 
         Returns:
@@ -306,32 +299,29 @@ class RowCompressor:
         known = self._sums[support]
         added = known.levels.are_of(gram, squares) and known.add(gram)
         if added:
-            factor.count(count, oversampling)
+            self.factor.count(count, oversampling)
         return added
 
     def finish(self) -> None:
         """Bring the factor up to date."""
-        if self._factor is not None:
-            for support, known in self._sums.items():
-                self._factor.absorb(support, torch.from_numpy(known.levels.undo(known.triangle())))
+        for support, known in self._sums.items():
+            self.factor.absorb(support, torch.from_numpy(known.levels.undo(known.triangle())))
         self._sums.clear()
-        self._levels.clear()
+        self._levels.clear()  # later rows are added as if there had been none, whatever cuts them
 
     def _start(self, support: tuple[int, ...], X: Array) -> _Sum | None:
         """A sum of nothing, columns combined as for the rows before or by some of these; None if QR is as fast."""
         if support not in self._levels:
-            some = X[:, :: max(1, X.shape[1] // (_ROWS_PER_COLUMN * len(X)))].copy()
-            if not np.isfinite(some).all():
+            sampled = X[:, :: max(1, X.shape[1] // (_ROWS_PER_COLUMN * len(X)))].copy()
+            if not np.isfinite(sampled).all():
                 return None
-            levels = ColumnLevels.of(triangularize(torch.from_numpy(some).T).numpy())
+            levels = ColumnLevels.of(triangularize(torch.from_numpy(sampled).T).numpy())
             if len(levels.lower) > _MOST_COMBINED * len(X):
                 return None
             self._levels[support] = levels
-        return _Sum.of_nothing(self._levels[support])
+        return _Sum.zeros(self._levels[support])
 
-    def _factorize(
-        self, factor: TriangularFactor, support: tuple[int, ...], stacked: Tensor, known: _Sum, combined: bool
-    ) -> None:
+    def _factorize(self, support: tuple[int, ...], stacked: Tensor, known: _Sum, combined: bool) -> None:
         """Add rows, their columns `combined` or not, and what they were to be added to, by QR; combine columns anew."""
         before = known.triangle() if combined else known.levels.undo(known.triangle())
         stacked[: stacked.shape[1]] = torch.from_numpy(before)
@@ -339,10 +329,10 @@ class RowCompressor:
         R = known.levels.undo(R) if combined else R
         self._sums.pop(support, None)
         if np.isfinite(R).all():
-            anew = _Sum.of_nothing(ColumnLevels.of(R))
+            anew = _Sum.zeros(ColumnLevels.of(R))
             self._levels[support] = anew.levels
             gram = anew.levels.apply(R.T.copy(), 0, self._write_gram)
             if gram is not None and anew.add(gram):
                 self._sums[support] = anew
                 return
-        factor.absorb(support, torch.from_numpy(R))
+        self.factor.absorb(support, torch.from_numpy(R))

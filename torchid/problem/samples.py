@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,22 +17,25 @@ from torchid.logs import Log
 from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
-from torchid.parameters import WRENCH_COMPONENTS, Array
+from torchid.parameters import GRAVITY, WRENCH_COMPONENTS, Array
 from torchid.problem import log_joints
 from torchid.problem.log_joints import columns_in_order, joint_order, recorded_torques
 from torchid.problem.motion import (
+    MIN_MOTION,
+    MIN_TURN_DEG,
     BaseMotion,
     MotionNoise,
     base_motion,
     bind_motion_noise,
     imu_pose,
     position_for_moments,
+    random_sides,
 )
 from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.reprs import short_repr
 from torchid.robot import Robot
-from torchid.sensing import Contact, SensorSet
+from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX, recorded_components
 
 _AS_MEASURED = "numbers throughout, as of a sensor that is there, or sensors without it"
@@ -179,6 +183,28 @@ class Samples:
         omega, alpha = (zero if x is None else x for x in (base.angular_velocity, base.angular_acceleration))
         joints = self.joint_position, self.joint_velocity, self.joint_acceleration
         return Motion(*joints, omega, alpha, force, self.direction)
+
+    def perturbed(self, noise: MotionNoise, size: Tensor) -> Samples:
+        """The samples with as much noise of the motion again, times a `size`, (B, 1), see `MotionNoise.drawn`."""
+        (q, v, a), of_base = noise.drawn(self.time, size)
+        return replace(
+            self,
+            joint_position=self.joint_position + q,
+            joint_velocity=self.joint_velocity + v,
+            joint_acceleration=self.joint_acceleration + a,
+            base=noise.added_to(self.base, of_base),
+        )
+
+    def with_noise_alone(self, noise: SensorNoise) -> Samples:
+        """The samples with readings that are noise of the forces alone, drawn as that of the motion is."""
+        torque, wrench = self.torque, self.wrench
+        if torque is not None:
+            std = torque.new_tensor(noise.dof_std(self.joint_position.shape[1], torque.shape[1]))
+            torque = 0.0 * torque + std * random_sides(self.time, len(std))
+        if wrench is not None:
+            sides = random_sides(self.time, wrench.shape[1] * 6).unflatten(1, (-1, 6))
+            wrench = 0.0 * wrench + wrench.new_tensor(noise.wrench_std) * sides
+        return replace(self, torque=torque, wrench=wrench)
 
     def coordinates(self) -> tuple[Tensor, Tensor, Tensor]:
         """Generalized coordinates q (N, n + 7), v and a (N, nv) as `Regressor` takes them.
@@ -415,3 +441,31 @@ def _scalar_error(samples: Samples, frame: str, sample: int, k: int) -> LogError
         return LogError(samples.source, field, "missing", f"the field, or sensors without {NORMAL_FORCE}")
     found = f"not a finite number at sample {sample}, while in contact"
     return LogError(samples.source, field, found, _AS_MEASURED)
+
+
+_MIN_ACCELERATION = 0.1 * GRAVITY  # [m/s^2] rms, of a base that is shaken; noise of a pose in half a millimetre: 0.4
+_MOST_SAMPLES = 5_000  # evenly spaced
+
+
+def is_at_rest(logs: Sequence[Samples]) -> bool:
+    """Whether in none of some logs a joint or the base moves; not so without any log.
+
+    Forces at rest tell what balances gravity, no inertia and no friction.
+    """
+    return bool(logs) and not any(_moves(log) for log in logs)
+
+
+def _moves(log: Samples) -> bool:
+    """Whether a joint of a filtered log travels, or its base turns or is shaken."""
+    thin = log.every(max(1, len(log) // _MOST_SAMPLES))
+    position, base = thin.joint_position, thin.base
+    if position.shape[1] and float((position.amax(dim=0) - position.amin(dim=0)).max()) > MIN_MOTION:
+        return True
+    if base.quat_xyzw is not None:
+        cosine = (base.quat_xyzw @ base.quat_xyzw[0]).abs().clamp(max=1.0)
+        if float(2.0 * torch.arccos(cosine).max()) > math.radians(MIN_TURN_DEG):
+            return True
+    force = base.specific_force
+    if force is None:
+        return False
+    return float((force - force.mean(dim=0)).square().sum(dim=1).mean().sqrt()) > _MIN_ACCELERATION

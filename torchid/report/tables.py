@@ -114,7 +114,7 @@ def error_tables(columns: Mapping[str, Comparison[Metrics]], of: str) -> list[Ta
 def _error_table(columns: Mapping[str, Comparison[Metrics]], of: str) -> Table:
     headings = ["", *(f"{name}\n{parameter_set}" for name in columns for parameter_set in (of, "identified"))]
     identified = [pair.identified for pair in columns.values()]
-    groups = ERROR_GROUPS | (LIMB_GROUPS if any(x.limb_rms for x in identified) else {})
+    groups = ERROR_GROUPS | (LIMB_GROUPS if any("ft_force" in x.rms for x in identified) else {})
     groups |= PRESSURE_GROUP if any(PRESSURE in x.rms for x in identified) else {}
     rows: list[list[str]] = []
     for group, label in groups.items():

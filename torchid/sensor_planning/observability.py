@@ -293,7 +293,7 @@ def demands(
 def _jacobian(builder: RowBuilder, posture: Samples, robot: Robot) -> Array:
     """Jacobians (C, 6, n_rows) of all contacts at a posture, by the motion of motors where there are loops."""
     J = builder.contact_jacobian(posture).permute(1, 2, 0, 3)
-    by_motors = builder.motors.of(builder.tree, builder.kinematics(posture), J)[:, :, 0].numpy()
+    by_motors = builder.motors.of(builder.tree, builder.kinematics(posture).states, J)[:, :, 0].numpy()
     by_motors[..., [robot.base_rows + dof for dof in builder.motors.passive]] = 0.0
     if np.isnan(by_motors).any():
         reason = "loops in which motors do not determine how the other joints move"
