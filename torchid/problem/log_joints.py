@@ -63,8 +63,8 @@ def _with_passive(torque: FloatArray, log: Log, robot: Robot) -> FloatArray:
     if driven.any():
         names = [robot.joint_names[joint] for joint in np.flatnonzero(driven)]
         found = f"{join_names(names, _LISTED)}: up to {size[driven].max():.3g} N m, without a motor"
-        rest = ", ".join(name for name in robot.passive if name not in names)
-        raise LogError(log.source, "joint_torque", found, f"0, NaN or none, or robot.passive: [{rest}]")
+        others = ", ".join(name for name in robot.passive if name not in names)
+        raise LogError(log.source, "joint_torque", found, f"0, NaN or none, or robot.passive: [{others}]")
     return np.where(passive, 0.0, torque)
 
 
@@ -279,10 +279,10 @@ class _Joints:
         for start in range(0, len(q), _CHUNK):
             rows = slice(start, start + _CHUNK)
             J = self.closures.jacobian(q[rows])[..., : self.robot.n]
-            left = (J @ out[rows, :, None])[..., 0]
+            gap_rate = (J @ out[rows, :, None])[..., 0]
             if velocity is not None:
-                left = left + self.closures.drift(q[rows], velocity[rows])
-            out[rows, self.missing] -= (torch.linalg.pinv(J[..., self.missing]) @ left[..., None])[..., 0]
+                gap_rate = gap_rate + self.closures.drift(q[rows], velocity[rows])
+            out[rows, self.missing] -= (torch.linalg.pinv(J[..., self.missing]) @ gap_rate[..., None])[..., 0]
         return out
 
     def _require_determined(self, q: Tensor) -> None:

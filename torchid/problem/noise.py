@@ -110,7 +110,7 @@ class SampledRows:
         self._drawn = max(most, 1), chunk
         drawn = list(_random_chunks(logs, *self._drawn))
         for samples, state in drawn:
-            builder.layout(state, samples.contact_normal is not None)
+            builder.layout_of(samples, state)
         self.chunks = map_in_workers(drawn, lambda one: self._chunk(*one), worker_count(builder.device))
         elsewhere = any(isinstance(log, LogOfOtherProcess) for log in logs)
         if any(distributed.all_gather(elsewhere, "logs that others have")):
@@ -182,9 +182,9 @@ class SampledRows:
                 root, readings = weight.sqrt(), readings * weight[:, None]
             factor = TriangularFactor(self.builder.width)
             for support, slots in supports(rows).items():
-                own = rows[:, torch.tensor(slots)[:, None], torch.tensor([*support, self.builder.width])]
-                own *= root[:, None, None]
-                factor.add(support, own[present[:, slots]], chunk.oversampling)
+                weighted = rows[:, torch.tensor(slots)[:, None], torch.tensor([*support, self.builder.width])]
+                weighted *= root[:, None, None]
+                factor.add(support, weighted[present[:, slots]], chunk.oversampling)
             for column, sources in self._scaled.items():
                 factor.add_noise_gram(noise_of_reading(column, readings[:, sources].sum()))
             return factor
@@ -265,8 +265,8 @@ def information_about(index: np.ndarray, information: Array, score: Array) -> tu
     size = 1.0 / np.sqrt(np.where(np.diag(known) > 0.0, np.diag(known), 1.0))  # of base rows that are lost: 0
     known = known * size * size[:, None] + _HELD_OTHERS * np.eye(len(others))
     across = size * scipy.linalg.solve(known, size[:, None] * information[np.ix_(others, index)], assume_a="pos").T
-    own = information[np.ix_(index, index)] - across @ information[np.ix_(others, index)]
-    return own, score[index] - across @ score[others]
+    conditional = information[np.ix_(index, index)] - across @ information[np.ix_(others, index)]
+    return conditional, score[index] - across @ score[others]
 
 
 def prior_precision(logarithms: Array, information: Array, score: Array) -> Array:
@@ -350,31 +350,6 @@ class GroupVariances:
         return self.estimated & ~self.upper_bound & (self.error > _CONFOUNDED)
 
 
-@dataclass(frozen=True)
-class _Residuals:
-    """Residuals of the rows, by chunk, and the degrees of freedom that the fit leaves.
-
-    `r`: (B, n_rows), residuals; `left`, (G,), share of each group's degrees of freedom that remain after the fit;
-    `independent`, (G,), number of independent readings.
-    """
-
-    r: list[Tensor]
-    left: Array
-    independent: Array
-
-
-@dataclass(frozen=True)
-class _Prior:
-    """Of groups that are alike: `precision` of the logarithms of their variances, (G, G), zero of all others.
-
-    `weight`, (G, G), and `pull`, (G,), are its part of the equations M x = q, with x the factors of the variances.
-    """
-
-    precision: Array
-    weight: Array
-    pull: Array
-
-
 class VarianceComponentEstimator:
     """Estimates variances of groups from residuals at fitted parameters."""
 
@@ -407,13 +382,14 @@ class VarianceComponentEstimator:
             columns: parameters in the builder's columns, (width,), by log.
             directions: that the fit was free in, by log, from `fitted_directions`.
         """
-        residuals, start = self._residuals(variance, columns, directions), variance
-        estimated = self._enough(residuals.independent) @ self._blocks > 0.0
-        first, *_ = M, q, t, count = self._moments(residuals, variance)
+        start = variance
+        residuals, remaining, independent = self._residuals(variance, columns, directions)
+        estimated = self._enough(independent) @ self._blocks > 0.0
+        first, *_ = M, q, t, count = self._moments(residuals, remaining, variance)
         for _ in range(_STEPS):
             share = np.divide(t, count, out=np.ones_like(t), where=count > 0.0)
-            prior = self._prior(M, q, variance, residuals)
-            step = self._step(M + prior.weight, q + prior.pull, estimated)
+            _, weight, pull = self._prior(M, q, variance, remaining)
+            step = self._step(M + weight, q + pull, estimated)
             least = np.maximum(_SHARE / np.maximum(share, 1e-12), self._smallest**2 / variance)
             least_of_block = np.where(self._blocks > 0.0, least[:, None], 0.0).max(axis=0, initial=0.0)
             step = np.where(estimated, np.maximum(step, least_of_block), 1.0)
@@ -421,9 +397,9 @@ class VarianceComponentEstimator:
             variance = variance * factor
             if _change(M, factor) < _STEADY:
                 break
-            M, q, t, count = self._moments(residuals, variance)
-        information = self._information(M, residuals)
-        precision = self._prior(M, q, variance, residuals).precision
+            M, q, t, count = self._moments(residuals, remaining, variance)
+        information = self._information(M, remaining)
+        precision, _, _ = self._prior(M, q, variance, remaining)
         error = _relative_errors(2.0 * (information + precision))
         return GroupVariances(
             variance,
@@ -441,22 +417,27 @@ class VarianceComponentEstimator:
             enough[index] = readings[index].sum() > _FEW
         return enough
 
-    def _information(self, M: Array, residuals: _Residuals) -> Array:
+    def _information(self, M: Array, remaining: Array) -> Array:
         """Fisher information of Gaussian noise on the logarithms of the variances, (G, G)."""
-        return M * np.sqrt(np.outer(residuals.left, residuals.left)) / (2.0 * self.rows.oversampling)
+        return M * np.sqrt(np.outer(remaining, remaining)) / (2.0 * self.rows.oversampling)
 
-    def _prior(self, M: Array, q: Array, variance: Array, residuals: _Residuals) -> _Prior:
-        """That groups which are alike have variances of one size, as far as residuals show it."""
-        count, rows, left = len(variance), self.rows, residuals.left
-        information = self._information(M, residuals)
-        score = left * (q - M.sum(1)) / (2.0 * rows.oversampling)
-        logarithms = np.log(np.square(rows.reference_std) * variance)
+    def _prior(self, M: Array, q: Array, variance: Array, remaining: Array) -> tuple[Array, Array, Array]:
+        """That groups which are alike have variances of one size, as far as residuals show it.
+
+        Returns:
+            Precision of the logarithms of the variances, (G, G), zero of all others; its part of the equations
+            M x = q, with x the factors of the variances: (G, G) and (G,).
+        """
+        count, oversampling = len(variance), self.rows.oversampling
+        information = self._information(M, remaining)
+        score = remaining * (q - M.sum(1)) / (2.0 * oversampling)
+        logarithms = np.log(np.square(self.rows.reference_std) * variance)
         precision, weight = np.zeros((count, count)), np.zeros((count, count))
         for index in self._alike:
-            known, own = information_about(index, information, score), np.ix_(index, index)
-            precision[own] = prior_precision(logarithms[index], *known)
-            weight[own] = 2.0 * rows.oversampling / left[index].mean() * precision[own]  # 0 along equal factors
-        return _Prior(precision, weight, -weight @ logarithms)
+            known, places = information_about(index, information, score), np.ix_(index, index)
+            precision[places] = prior_precision(logarithms[index], *known)
+            weight[places] = 2.0 * oversampling / remaining[index].mean() * precision[places]  # 0 along equal factors
+        return precision, weight, -weight @ logarithms
 
     def _step(self, M: Array, q: Array, estimated: np.ndarray) -> Array:
         """Factors of the unknown variances at which the squares are the expected ones; confounded ones stay near 1."""
@@ -474,13 +455,15 @@ class VarianceComponentEstimator:
         out[free] = _LEAST_STEP + size * scipy.optimize.nnls(L.T, target)[0]
         return out
 
-    def _moments(self, residuals: _Residuals, variance: Array) -> tuple[Array, Array, Array, Array]:
+    def _moments(
+        self, residuals: Sequence[Tensor], remaining: Array, variance: Array
+    ) -> tuple[Array, Array, Array, Array]:
         """M (G, G), q (G,) of the equations M x = q; variance in the rows and number of readings by group, (G,)."""
         group_of, count = self.rows.group_of, len(variance)
         index, scale = torch.from_numpy(group_of), torch.from_numpy(np.sqrt(variance)[group_of])
 
         def of_chunk(number: int) -> tuple[Tensor, Tensor, Tensor]:
-            chunk, r = self.rows.chunks[number], residuals.r[number]
+            chunk, r = self.rows.chunks[number], residuals[number]
             sources = scale[:, None] * chunk.sources
             both = torch.cat([sources.mT, r[..., None]], dim=2)
             solved = torch.linalg.solve_triangular(noise_root(sources), both, upper=False)
@@ -489,42 +472,48 @@ class VarianceComponentEstimator:
             M.index_put_((index[:, None], index), (white.mT @ white).square().sum(0), accumulate=True)
             return M, white.square().sum(1), (white.mT @ y)[..., 0]
 
-        parts = map_in_workers(range(len(residuals.r)), of_chunk)
+        parts = map_in_workers(range(len(residuals)), of_chunk)
         M = torch.stack([x for x, *_ in parts]).sum(0)
         size, score = (torch.cat([part[k] for part in parts]).numpy() for k in (1, 2))
         q, t, n = (np.zeros(count) for _ in range(3))
         for group in range(count):
-            own, scores = size[:, group_of == group], score[:, group_of == group]
-            present = own > _NEGLIGIBLE
-            t[group], n[group] = own.sum(), present.sum()
+            sizes, scores = size[:, group_of == group], score[:, group_of == group]
+            present = sizes > _NEGLIGIBLE
+            t[group], n[group] = sizes.sum(), present.sum()
             if present.any():
-                q[group] = t[group] * _clipped_variance(scores[present] / np.sqrt(own[present]), own[present])
-        return M.numpy(), q / residuals.left, t, n
+                q[group] = t[group] * _clipped_variance(scores[present] / np.sqrt(sizes[present]), sizes[present])
+        return M.numpy(), q / remaining, t, n
 
     def _residuals(
         self, variance: Array, columns: Mapping[str, Tensor], directions: Mapping[str, Tensor]
-    ) -> _Residuals:
+    ) -> tuple[list[Tensor], Array, Array]:
+        """Residuals of the rows, (B, n_rows) by chunk, and what of each group remains.
+
+        Returns:
+            The residuals; the share of each group's degrees of freedom that remains after the fit, (G,); its number of
+            independent readings, (G,).
+        """
         rows, group_of = self.rows, self.rows.group_of
         leverages, size, readings = (np.zeros(len(variance)) for _ in range(3))
 
         def of_chunk(chunk: SampledChunk) -> tuple[Tensor, Tensor, Tensor]:
             white = rows.whiten(chunk, variance, _THINNED)
-            own = white.sources.square().sum(2)
+            sizes = white.sources.square().sum(2)
             fitted = white.rows.new_zeros(*white.rows.shape[:2], directions[chunk.log].shape[1])
             for support, slots in supports(white.rows).items():
                 at = torch.tensor(support, dtype=torch.long)
                 fitted[:, slots] = white.rows[:, torch.tensor(slots)[:, None], at] @ directions[chunk.log][at]
             leverage = (white.sources[::_THINNED] @ fitted).square().sum((0, 2))
-            return leverage, own[::_THINNED].sum(0), (own > _NEGLIGIBLE).sum(0)
+            return leverage, sizes[::_THINNED].sum(0), (sizes > _NEGLIGIBLE).sum(0)
 
         for chunk, found in zip(rows.chunks, map_in_workers(rows.chunks, of_chunk), strict=True):
-            leverage, own, count = (x.numpy() for x in found)
+            leverage, sizes, count = (x.numpy() for x in found)
             np.add.at(leverages, group_of, chunk.oversampling * leverage)
-            np.add.at(size, group_of, own)
+            np.add.at(size, group_of, sizes)
             np.add.at(readings, group_of, count / chunk.oversampling)
         remaining = 1.0 - np.divide(leverages, size, out=np.zeros_like(size), where=size > 0.0)
         r = map_in_workers(rows.chunks, lambda chunk: chunk.rows[..., :-1] @ columns[chunk.log] - chunk.rows[..., -1])
-        return _Residuals(r, np.maximum(remaining, _LEFT), readings * np.maximum(remaining, 0.0))
+        return r, np.maximum(remaining, _LEFT), readings * np.maximum(remaining, 0.0)
 
 
 def _forces(rows: SampledRows) -> Array:
@@ -542,8 +531,8 @@ def _forces(rows: SampledRows) -> Array:
 
 def _is_pooled(precision: Array, error: Array) -> np.ndarray:
     """Whether the prior weighs more than the residuals in a group's variance, whose deviation has such errors."""
-    own = np.diag(precision)
-    return (own > 0.0) & (np.square(2.0 * error) > _POOLED / np.where(own > 0.0, own, 1.0))
+    of_prior = np.diag(precision)
+    return (of_prior > 0.0) & (np.square(2.0 * error) > _POOLED / np.where(of_prior > 0.0, of_prior, 1.0))
 
 
 def _relative_errors(M: Array) -> Array:
@@ -570,13 +559,13 @@ def fitted_directions(assembly: Assembly, builder: RowBuilder, log: str) -> Tens
     found = np.zeros((len(problem.nominal), int(kept.sum())))
     found[problem.free] = scale[:, None] * Vh[kept].T / values[kept]
     places = {extra.label: builder.columns.count + number for number, extra in enumerate(builder.extras)}
-    own = sorted((x for x in assembly.eliminations if x.log in ("", log)), key=lambda x: x.log != "")
+    eliminations = sorted((x for x in assembly.eliminations if x.log in ("", log)), key=lambda x: x.log != "")
     extras: list[tuple[int, Array]] = []
-    for one in own:  # those of all logs first, which those of a log depend on
-        values_of = np.hstack([-one.inverse @ one.C @ found, one.inverse])
-        extras += zip((places[extra.label] for extra in one.extras), values_of, strict=True)
-        found = np.pad(found, ((0, 0), (0, one.inverse.shape[1])))
-        found = found if one.log else np.vstack([found, values_of])
+    for elimination in eliminations:  # those of all logs first, which those of a log depend on
+        values_of = np.hstack([-elimination.inverse @ elimination.C @ found, elimination.inverse])
+        extras += zip((places[extra.label] for extra in elimination.extras), values_of, strict=True)
+        found = np.pad(found, ((0, 0), (0, elimination.inverse.shape[1])))
+        found = found if elimination.log else np.vstack([found, values_of])
     G = np.zeros((builder.width, found.shape[1]))
     G[: builder.columns.count] = builder.columns.parameter_map @ found[: len(problem.nominal)]
     for place, row in extras:

@@ -54,10 +54,10 @@ def limb_null_space(
         motion, condition = _solve([limbs[number] for number in alike])
         suspect |= ~(condition < WELL_CONDITIONED**2)  # so written, undefined ones are suspect too
         white[BASE:m].index_copy_(0, torch.cat([joints[number] for number in alike]), motion)
-    base, own = white[:BASE], white[BASE:m]
+    base, of_joints = white[:BASE], white[BASE:m]
     for row, J, std in zip(white[m:], J_m, wrench_std, strict=True):
-        row[:] = std * ((J[BASE:, None] * own).sum(0) + J[:BASE])
-    own *= row_std[BASE:, None, None]
+        row[:] = std * ((J[BASE:, None] * of_joints).sum(0) + J[:BASE])
+    of_joints *= row_std[BASE:, None, None]
     base[:] = 0.0
     if axes is None:
         base.diagonal().copy_(row_std[:BASE])
@@ -66,7 +66,7 @@ def limb_null_space(
         for rows in _OF_BASE:
             base[rows, rows] = axes.transpose(0, 1) * row_std[rows, None, None]
     _orthonormalize(white, suspect)
-    own /= row_std[BASE:, None, None]
+    of_joints /= row_std[BASE:, None, None]
     if axes is None:
         base /= row_std[:BASE, None, None]
     else:
@@ -83,11 +83,11 @@ def _orthonormalize(columns: Tensor, suspect: Tensor) -> None:
     """
     least = PIVOT * columns.square().sum(0)
     for j in range(columns.shape[1]):
-        column, rest = columns[:, j], columns[:, j + 1 :]
+        column, later = columns[:, j], columns[:, j + 1 :]
         size = column.square().sum(0)
         suspect |= ~(size > least[j])
         column *= size.rsqrt_()
-        rest.addcmul_(column[:, None], (column[:, None] * rest).sum(0), value=-1)
+        later.addcmul_(column[:, None], (column[:, None] * later).sum(0), value=-1)
 
 
 def _solve(limbs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -99,12 +99,12 @@ def _solve(limbs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     X = torch.stack(list(limbs))
     size = X[:, :, BASE:].square().sum((1, 2))
     for done, column in enumerate(reversed(range(BASE + 1, BASE + k))):
-        v, rest = X[:, done:, column].clone(), X[:, done:, :column]
+        v, earlier = X[:, done:, column].clone(), X[:, done:, :column]
         length = torch.copysign((v * v).sum(1).sqrt_(), v[:, 0])
         v[:, 0] += length
-        along = _sum_of_products(v[:, :, None].unbind(1), rest.unbind(1))
+        along = _sum_of_products(v[:, :, None].unbind(1), earlier.unbind(1))
         along /= (length * v[:, 0])[:, None]
-        rest.addcmul_(v[:, :, None], along[:, None], value=-1)
+        earlier.addcmul_(v[:, :, None], along[:, None], value=-1)
         X[:, done, column] = -length
     for row in reversed(range(k)):
         column = BASE + k - 1 - row
