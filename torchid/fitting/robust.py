@@ -144,7 +144,7 @@ def fit_robustly(
         by_log: dict[str, list[Samples]] = {}
         for log in logs:
             by_log.setdefault(log.source, []).append(log.every(step))
-        rough = [replace(concatenate(pieces), fold=0, block=0) for pieces in by_log.values()]
+        rough = [replace(concatenate(pieces), fold=0) for pieces in by_log.values()]
         compress = partial(compress_parts, rough, builder)
         start = _passes(start, fitter, lambda weigh: compress(weight_rows=weigh), compress(), loss, 0, solve)
     compress_all = partial(compress_in_blocks, logs, builder, progress)

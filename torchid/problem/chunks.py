@@ -177,7 +177,7 @@ def are_of_one_log(piece: Samples, other: Samples) -> bool:
     if piece.unloaded is not None or other.unloaded is not None:
         return False
     fields, other_fields = (
-        {name: x for name, x in (vars(log) | vars(log.base)).items() if name not in ("base", "fold", "block", "blocks")}
+        {name: x for name, x in (vars(log) | vars(log.base)).items() if name not in ("base", "fold", "blocks")}
         for log in (piece, other)
     )
     return all(
@@ -191,7 +191,7 @@ def join_pieces(pieces: Sequence[Samples]) -> Samples:
     if len(pieces) == 1:
         return pieces[0]
     numbers = [
-        torch.tensor([[piece.fold, piece.block]]).expand(len(piece), 2) if piece.blocks is None else piece.blocks
+        torch.tensor([[piece.fold, 0]]).expand(len(piece), 2) if piece.blocks is None else piece.blocks
         for piece in pieces
     ]
     return replace(concatenate([replace(piece, blocks=None) for piece in pieces]), blocks=torch.cat(numbers))
@@ -200,7 +200,7 @@ def join_pieces(pieces: Sequence[Samples]) -> Samples:
 def blocks_in(samples: Samples) -> list[tuple[int, int, int, int]]:
     """Fold, number, first sample and end of the blocks that a chunk has samples of."""
     if samples.blocks is None:
-        return [(samples.fold, samples.block, 0, len(samples))]
+        return [(samples.fold, 0, 0, len(samples))]
     numbers, counts = torch.unique_consecutive(samples.blocks, return_counts=True, dim=0)
     ends = counts.cumsum(0).tolist()
     spans = zip(numbers.tolist(), [0, *ends[:-1]], ends, strict=True)

@@ -357,7 +357,7 @@ def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part
     for log in logs:
         for state, index in chunks_by_state(log) if log.unloaded is not None else ():
             samples = log[index]
-            key = PartKey(log.source, state, log.fold, log.block, True)
+            key = PartKey(log.source, state, log.fold, 0, True)
             for channel in unloaded_offset_equations(builder, samples):
                 part = parts.setdefault(key, Part(log.source, state, TriangularFactor(builder.width), 0, *key[2:]))
                 if channel.masked:

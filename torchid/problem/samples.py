@@ -68,8 +68,7 @@ class Samples:
         direction, stribeck: (N, n), what Coulomb and Stribeck friction go with, as in `Log`; None for the velocity's.
         folder: where the tensors of a log larger than memory are stored; None for one in memory.
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
-        block: number of the block in which they are compressed, see `compress_in_blocks`.
-        blocks: (N, 2), fold and block of each sample; None for those that all are in.
+        blocks: (N, 2), fold and block of each sample; None for `fold` and block 0 of all.
         has_force_normal: whether the log has forces along the ground's normal, which contacts may be read along.
         motion_noise: noise of the motion, None without any.
         pages: of files that the tensors are mapped to; None for those in memory.
@@ -95,7 +94,6 @@ class Samples:
     direction: Tensor | None = None
     folder: Path | None = None
     fold: int = 0
-    block: int = 0
     has_force_normal: bool = False
     motion_noise: MotionNoise | None = None
     payload: Array | None = None
