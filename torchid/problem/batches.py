@@ -93,13 +93,17 @@ class MiniBatches:
             raise ValueError(f"batch_size: found {batch_size}; accepted: at least 1")
         if builder.extras and assembly is None:
             raise ValueError("builder: found extra terms; accepted: one without, or an assembly")
-        self.builder, self.batch_size, self.seed, self.assembly = builder, batch_size, seed, assembly
+        self.builder = builder
+        self.batch_size = batch_size
+        self.seed = seed
+        self.assembly = assembly
         terms = None if assembly is None else assembly.problem.terms
         identity = np.eye(0 if terms is None else len(terms.size))
         self.columns = torch.from_numpy(block_diag(builder.columns.parameter_map, identity)).to(builder.device)
         self._eliminated = {log.source: self._elimination(log.source) for log in logs} if builder.extras else {}
         self.samples = sum(map(len, logs))
-        self._logs, self._memory = tuple(logs), memory
+        self._logs = tuple(logs)
+        self._memory = memory
         self.share = share
         self._starts = torch.tensor([0, *(len(log) for log in logs)]).cumsum(0).tolist()
         chunk = max(_CHUNK // batch_size, 1) * batch_size
@@ -116,7 +120,8 @@ class MiniBatches:
 
     def sized_epoch(self, number: int) -> Iterator[tuple[Batch, int]]:
         """As `epoch`, each batch with the number of samples that all processes together have in it."""
-        generator, (rank, size) = self._generator(number), self.share
+        generator = self._generator(number)
+        rank, size = self.share
         for chunk in torch.randperm(len(self._chunks), generator=generator).tolist():
             order = torch.randperm(len(self._chunks[chunk]), generator=generator)
             rows = self._rows(chunk)
@@ -161,13 +166,15 @@ class MiniBatches:
     def _compute_rows(self, index: Tensor) -> Batch:
         """Rows of numbered samples, sorted by log and contact state; this share has every so-many-th of these."""
         parts: list[Batch] = []
-        (rank, size), before = self.share, 0
+        rank, size = self.share
+        before = 0
         with one_thread():
             for log, start, end in zip(self._logs, self._starts, self._starts[1:], strict=False):
                 samples = log[index[(index >= start) & (index < end)] - start].to(self.builder.device)
                 for state, where in chunks_by_state(samples, len(index)):
                     chosen = samples[where]
-                    share, before = chosen[(rank - before) % size :: size], before + len(chosen)
+                    share = chosen[(rank - before) % size :: size]
+                    before += len(chosen)
                     if len(share) or not parts:  # of a chunk with fewer samples than processes at least the shapes
                         parts.append(self._batch(share if len(share) else chosen[:1], state)[: len(share)])
         return Batch(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Batch)))
@@ -186,7 +193,8 @@ class MiniBatches:
         """
         if self.assembly is None:
             raise ValueError("assembly: found None; accepted: one that eliminates the extra parameters")
-        parameter_map, kept = self.builder.columns.parameter_map, len(self.columns)
+        parameter_map = self.builder.columns.parameter_map
+        kept = len(self.columns)
         rhs = np.eye(1, kept + 1, kept)
         x = np.pad(np.linalg.pinv(parameter_map), ((0, 0), (0, kept + 1 - len(parameter_map))))
         values: dict[str, Array] = {}

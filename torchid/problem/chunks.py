@@ -30,11 +30,13 @@ ProgressCallback = Callable[[int], None]
 CHUNK = 4096
 """Samples per chunk: fewer lose to dispatch, and to workers' waits for Python's lock; more to memory traffic."""
 
-_LEAST, _EACH = 2048, 4  # samples per chunk where there are fewer chunks than so many for each worker
+_LEAST = 2048
+_EACH = 4  # samples per chunk where there are fewer chunks than so many for each worker
 _LET_GO = 4  # chunks of a worker, after which pages that samples are mapped to leave the memory of the process
 _WORTH_LOADING = 200_000  # samples of a pass: kernels take 0.4 s to load and save 2.6 to 6 us of each on two cores
 _MOST_ON_GPU = 64 * CHUNK  # samples per chunk: launching the work on one takes the host 12 ms, whatever its size
-_SHARE_OF_GPU, _ON_GPU = 8, 48 * 2**10  # a chunk takes one of so many parts of a GPU's memory; bytes of a sample
+_SHARE_OF_GPU = 8
+_ON_GPU = 48 * 2**10  # a chunk takes one of so many parts of a GPU's memory; bytes of a sample
 
 
 def map_chunks(
@@ -59,7 +61,8 @@ def map_chunks(
         progress: called with the number of samples done since the last call.
     """
     workers = threads or worker_count(builder.device)
-    size, sharing = chunk or chunk_size(builder.device), distributed.broadcast(workers, "workers")
+    size = chunk or chunk_size(builder.device)
+    sharing = distributed.broadcast(workers, "workers")
     if chunk is None and sharing > 1:
         size = min(size, max(sum(map(len, logs)) // (_EACH * sharing), _LEAST))
     tasks = _chunks(logs, size, sharing)
@@ -125,8 +128,12 @@ class _ProgressOfAll:
     """Reports samples as if all processes were as far as this one, to a callback that need not be thread-safe."""
 
     def __init__(self, progress: ProgressCallback, total: int, own: int) -> None:
-        self._progress, self._total, self._own = progress, total, own
-        self._lock, self._done, self._reported = threading.Lock(), 0, 0
+        self._progress = progress
+        self._total = total
+        self._own = own
+        self._lock = threading.Lock()
+        self._done = 0
+        self._reported = 0
 
     def __call__(self, samples: int) -> None:
         """Add samples that this process has done; 0 at the end of the pass."""

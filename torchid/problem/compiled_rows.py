@@ -61,10 +61,14 @@ class _Limbs(NamedTuple):
 
     @classmethod
     def of(cls, tree: KinematicTree, layout: ContactStateLayout) -> _Limbs:
-        table, wrenches, dofs = list[list[int]](), list[Tensor](), list[int]()
-        moved, ratios = list[tuple[int, int]](), list[float]()
+        table = list[list[int]]()
+        wrenches = list[Tensor]()
+        dofs = list[int]()
+        moved = list[tuple[int, int]]()
+        ratios = list[float]()
         for body in layout.contact_bodies:
-            first, count = len(moved), len(body.joints)
+            first = len(moved)
+            count = len(body.joints)
             for number, joint in enumerate(body.joints):
                 for node in tree.path(body.body):
                     if ratio := float(tree.joint_map[node, layout.coupled_joints[joint]]):
@@ -91,10 +95,15 @@ class _BlockTables:
     @classmethod
     def of(cls, blocks: tuple[RowBlock, ...], base: int, dofs: int | None) -> _BlockTables:
         """Of blocks that combine so many degrees of freedom after those of the base; None for one row and one each."""
-        table, moved, ratios = list[list[int]](), list[list[int]](), list[float]()
-        bodies, kept, first = list[list[int]](), list[int](), 1  # the first path sum stays 0
+        table = list[list[int]]()
+        moved = list[list[int]]()
+        ratios = list[float]()
+        bodies = list[list[int]]()
+        kept = list[int]()
+        first = 1  # the first path sum stays 0
         for number, block in enumerate(blocks):
-            of_base, width = int(block.base != "none"), len(block.support) + 1
+            of_base = int(block.base != "none")
+            width = len(block.support) + 1
             if dofs is None:
                 table.append([0, 1, width, 0, 0, number, number + 1])
             else:
@@ -102,7 +111,8 @@ class _BlockTables:
                 table.append([block.rows.start, count, width, 0, first * of_base, 0, base + dofs])
             for place, (node, moving, ratio, above) in enumerate(block.moved):
                 upper = 0 if above is None else first + above
-                dof, column = number if dofs is None else base + moving, len(block.inertial) + 2 * place
+                dof = number if dofs is None else base + moving
+                column = len(block.inertial) + 2 * place
                 moved.append([number, node, dof, first + of_base + place, upper, column])
                 ratios.append(ratio)
             column = 0
@@ -129,7 +139,8 @@ class _BlockTables:
 
     def placed(self, samples: int) -> tuple[np.ndarray, int]:
         """The blocks, one after the other in memory for so many samples, and how many numbers they are."""
-        out, width = self.blocks.copy(), self.blocks[:, 2]
+        out = self.blocks.copy()
+        width = self.blocks[:, 2]
         sizes = width * (width + self.blocks[:, 1] * samples)
         out[:, 3] = _starts(sizes)
         return out, int(sizes.sum())
@@ -157,7 +168,8 @@ class _Group:
 
     def arrays(self, workspace: Workspace) -> tuple[Array, Array, int, int, Array, int, int, Array]:
         """The first arguments of `rows.write_rows`."""
-        joints, samples = self.tiles.joints, self.tiles.samples
+        joints = self.tiles.joints
+        samples = self.tiles.samples
         forces = workspace.empty("forces", self.W, self.f.shape[1], samples)
         forces.copy_(self.f.T)
         step = self.W[0].numel() if len(self.W) > 1 else 0
@@ -214,13 +226,15 @@ class CompiledChunk:
     def _multiplied(self, group: _Group, levels: Sequence[ColumnLevels]) -> Iterator[tuple[RowBlock, Array, Array]]:
         tables = group.tables
         placed, size = tables.placed(min(SPAN, group.tiles.samples))
-        flat, widths = self.workspace.empty("rows", group.W, size), tables.blocks[:, 2]
+        flat = self.workspace.empty("rows", group.W, size)
+        widths = tables.blocks[:, 2]
         counts = np.array([len(x.lower) for x in levels])
         lower, combination = (
             np.concatenate([getattr(x, name).ravel() for x in levels]) for name in ("lower", "to_lower")
         )
         table = np.column_stack([_starts(counts), counts, _starts(counts * widths), _starts(widths**2)])
-        squares, grams = np.empty(len(lower)), np.empty(int((widths**2).sum()))
+        squares = np.empty(len(lower))
+        grams = np.empty(int((widths**2).sum()))
         write_grams(
             *(*group.arrays(self.workspace), placed, *tables.of_bodies, table, lower, combination, flat.numpy()),
             *(squares, grams),
@@ -231,7 +245,9 @@ class CompiledChunk:
 
     def _complete(self, made: BlockRows, W: Tensor, in_W: Mapping[int, int]) -> None:
         """Write what kernels leave out: a known payload, and columns of extra parameters; see `_Group`."""
-        builder, samples, block = self.builder, self.samples, made.block
+        builder = self.builder
+        samples = self.samples
+        block = made.block
         subtract_payload(block, made.values, samples.payload, builder.columns.parameter_map)
         first = len(block.inertial) + len(block.friction)
         for out, column in zip(made.values[first:-1], block.extras, strict=True):
@@ -265,13 +281,15 @@ class CompiledRows:
         """The rows of a chunk, coupled ones first; None where joints rest or ranks of contacts differ."""
         if samples.resting is not None:
             return None
-        builder, tiles = self._builder, self._tiles(samples.motion(), workspace)
+        builder = self._builder
+        tiles = self._tiles(samples.motion(), workspace)
         bases = self._bases_by_kernel if _stands_on_limbs(builder, layout) else self._bases
         coupled = bases(samples, layout, tiles, workspace)
         if coupled is None:
             return None
         of_rank = layout.blocks.of_rank(coupled[0].shape[2])
-        joints, apart = list(layout.uncoupled_joints), tuple(layout.uncoupled_joints.values())
+        joints = list(layout.uncoupled_joints)
+        apart = tuple(layout.uncoupled_joints.values())
         in_W = {joint: row for row, joint in enumerate(layout.coupled_joints, start=builder.tree.base_rows)}
         weights = torch.from_numpy(1.0 / builder.dof_std[joints])[None, :, None, None].repeat(1, 1, 1, TILE)
         torque = builder.torque_of_bodies(samples)[:, builder.tree.index(joints)]
@@ -293,12 +311,15 @@ class CompiledRows:
         padded = -(-samples // TILE) * TILE
         out = workspace.empty("joints", joints.position, 6, nodes, padded)
         base = workspace.empty("base", joints.position, 9, padded)
-        out[..., samples:], base[:, samples:] = 0.0, 0.0
-        used, angle = out[..., :samples], joints.position * self._builder.tree.revolute
+        out[..., samples:] = 0.0
+        base[:, samples:] = 0.0
+        used = out[..., :samples]
+        angle = joints.position * self._builder.tree.revolute
         torch.cos(angle, out=used[states.COSINE])
         torch.sin(angle, out=used[states.SINE])
         torch.mul(joints.position, self._builder.tree.prismatic, out=used[states.SLIDE])
-        used[states.VELOCITY], used[states.ACCELERATION] = joints.velocity, joints.acceleration
+        used[states.VELOCITY] = joints.velocity
+        used[states.ACCELERATION] = joints.acceleration
         used[states.DIRECTION] = joints.direction
         of_base = (motion.base_angular_velocity, motion.base_angular_acceleration, motion.base_specific_force)
         torch.cat([x.T for x in of_base], out=base[:, :samples])
@@ -310,7 +331,8 @@ class CompiledRows:
         self, samples: Samples, layout: ContactStateLayout, tiles: _Tiles, workspace: Workspace
     ) -> tuple[Tensor, Tensor] | None:
         """Tiles (T, degrees of freedom, rank, TILE) of W, forces (B, degrees of freedom); None where ranks differ."""
-        builder, m = self._builder, len(layout.row_std)
+        builder = self._builder
+        m = len(layout.row_std)
         if not m:
             return tiles.states.new_empty(1, 0, 0, TILE), tiles.states.new_empty(tiles.samples, 0)
         chunk = builder.kinematics(samples)
@@ -320,7 +342,8 @@ class CompiledRows:
             return None
         basis = bases[0][1]
         padded = workspace.empty("W by row", basis, *basis.shape[:2], len(tiles.states) * TILE)
-        padded[..., : tiles.samples], padded[..., tiles.samples :] = basis, 0.0
+        padded[..., : tiles.samples] = basis
+        padded[..., tiles.samples :] = 0.0
         W = workspace.empty("W", basis, len(tiles.states), *basis.shape[:2], TILE)
         W.copy_(padded.unflatten(2, (-1, TILE)).permute(2, 0, 1, 3))
         return W, builder.coupled_forces_with_contacts(layout, contact, chunk)

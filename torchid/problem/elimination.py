@@ -141,15 +141,19 @@ def assemble(
     reading_noise = reading_noise or dict.fromkeys(scale_columns(builder), 0.0)
     prior = replace(column_prior(builder, robot, friction), reading_noise=reading_noise)
     corrected = corrected_triangle(everything, prior)
-    of_all_logs, noise, shrinkage = corrected.R, corrected.noise, corrected.shrinkage
-    forces, oversampling = float(np.square(of_all_logs[:, -1]).sum()), everything.oversampling
+    of_all_logs = corrected.R
+    noise = corrected.noise
+    shrinkage = corrected.shrinkage
+    forces = float(np.square(of_all_logs[:, -1]).sum())
+    oversampling = everything.oversampling
     if not builder.extras:
         problem = problem_from_triangle(of_all_logs, everything.rows, oversampling, builder, robot, friction, shrinkage)
         return Assembly(problem, (), problem, noise, forces)
     count = builder.columns.count
     per_log = [number for number, extra in enumerate(builder.extras) if extra.per_log]
     of_all = [number for number, extra in enumerate(builder.extras) if not extra.per_log]
-    eliminations, rows = list[Elimination](), of_all_logs
+    eliminations = list[Elimination]()
+    rows = of_all_logs
     if per_log:
         eliminations, rows, shrinkage = _eliminate_per_log(parts, builder, prior, per_log)
     if of_all:
@@ -178,11 +182,15 @@ def _eliminate_per_log(
     Returns:
         What was eliminated; the triangle of what is left of all logs, (R, columns without them + 1); its shrinkage.
     """
-    extras, at = tuple(builder.extras[number] for number in numbers), [builder.columns.count + n for n in numbers]
-    eliminations, remaining, lacking = [], [], []
+    extras = tuple(builder.extras[number] for number in numbers)
+    at = [builder.columns.count + n for n in numbers]
+    eliminations = []
+    remaining = []
+    lacking = []
     for source in dict.fromkeys(part.source for part in parts):
         corrected = corrected_triangle(merge_factors((p.factor for p in parts if p.source == source), builder), prior)
-        columns, others = corrected.R[:, at], np.delete(corrected.R, at, axis=1)
+        columns = corrected.R[:, at]
+        others = np.delete(corrected.R, at, axis=1)
         elimination, others = _eliminate(source, extras, columns, others, builder, np.linalg.norm(columns, axis=0))
         eliminations.append(elimination)
         remaining.append(others)
@@ -193,7 +201,8 @@ def _eliminate_per_log(
 
 def column_prior(builder: RowBuilder, robot: Robot, friction: bool = True) -> ColumnPrior:
     """The nominal parameters in the builder's columns, and deviations within their scale of those that are free."""
-    columns, nominal = builder.columns.parameter_map, robot.nominal.flatten()
+    columns = builder.columns.parameter_map
+    nominal = robot.nominal.flatten()
     scale = np.where(free_parameters(robot, friction), parameter_scale(robot.nominal).flatten(), 0.0)
     return ColumnPrior(columns @ nominal, columns * (PRIOR_DEVIATION * scale))
 
@@ -257,7 +266,8 @@ def _bounded_terms(of_all: Elimination, robot: Robot) -> EliminatedTerms | None:
             ]
     if not conditions:
         return None
-    size, labels = np.array([extra.size for extra in extras]), tuple(extra.label for extra in extras)
+    size = np.array([extra.size for extra in extras])
+    labels = tuple(extra.label for extra in extras)
     return EliminatedTerms(of_all.C, of_all.D, of_all.z, size, labels, tuple(conditions))
 
 
@@ -292,11 +302,13 @@ def _eliminate(
     present = is_significant(sizes)
     scale = np.where(present, sizes, 1.0)
     U, values, V, remaining = _project_off(np.where(present, columns / scale, 0.0), others)
-    top, count = U.T @ others, builder.columns.count
+    top = U.T @ others
+    count = builder.columns.count
     C = np.hstack([top[:, :count] @ builder.columns.parameter_map, top[:, count:-1]])
     std_if_known = np.where(present, 1.0 / scale, np.inf)
     unobservable = np.eye(len(extras)) - V @ V.T
-    inverse, D = (V / values) / scale[:, None], values[:, None] * V.T * scale
+    inverse = (V / values) / scale[:, None]
+    D = values[:, None] * V.T * scale
     elimination = Elimination(log, extras, inverse, C, D, top[:, -1], std_if_known, unobservable)
     return elimination, remaining
 

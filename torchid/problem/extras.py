@@ -311,9 +311,11 @@ class KnownTorques:
     def __init__(self, robot: Robot, extras: Sequence[Extra]) -> None:
         """Of a robot, those that are not `extras`."""
         fitted = {what: [dof for x in extras if x.what == what for dof in x.dofs] for what in ("armature", "stiffness")}
-        self._armature, self._stiffness = robot.armature.copy(), robot.stiffness.copy()
+        self._armature = robot.armature.copy()
+        self._stiffness = robot.stiffness.copy()
         self._armature[fitted["armature"]] = self._stiffness[fitted["stiffness"]] = 0.0
-        self._constant, self._others = robot.spring_torque, robot.n_dofs - robot.n
+        self._constant = robot.spring_torque
+        self._others = robot.n_dofs - robot.n
         self.none = not np.any([self._armature, self._stiffness, self._constant])
 
     def of(self, samples: Samples) -> Tensor:

@@ -149,12 +149,14 @@ def loop_gaps(robot: Robot, joint_position: torch.Tensor) -> list[LoopGap]:
     """The gap of each loop of a robot at joint positions (N, n) [rad or m]."""
     if not robot.loops or not len(joint_position):
         return []
-    closures, parts = LoopClosures(robot), list[Array]()
+    closures = LoopClosures(robot)
+    parts = list[Array]()
     for start in range(0, len(joint_position), _CHUNK):
         gaps = closures.gaps(joint_position[start : start + _CHUNK].double())
         parts.append(np.array([[x.numpy() for x in gap] for gap in gaps]))
     sizes = np.concatenate(parts, axis=2)  # (loops, 2, N)
-    rms, largest = np.sqrt(np.square(sizes).mean(axis=2)), sizes.max(axis=2)
+    rms = np.sqrt(np.square(sizes).mean(axis=2))
+    largest = sizes.max(axis=2)
     return [
         LoopGap(loop, float(r[0]), float(x[0]), float(r[1]), float(x[1]))
         for loop, r, x in zip(robot.loops, rms, largest, strict=True)
@@ -259,7 +261,8 @@ class _Joints:
     def _from_assembled(self, q: Tensor) -> Tensor:
         """The same, step by step from the posture nearest to joint positions of 0."""
         assembled, _ = self.closures.closed(torch.zeros(1, self.robot.n, dtype=torch.float64))
-        out, way = assembled.repeat(len(q), 1), (q - assembled)[:, self.known] / _PATH
+        out = assembled.repeat(len(q), 1)
+        way = (q - assembled)[:, self.known] / _PATH
         for _ in range(_PATH):
             out[:, self.known] += way
             out = self.closures.fitted(out, self.missing)

@@ -106,8 +106,10 @@ def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
     index = up.abs().argmax(dim=1, keepdim=True)
     nearest = torch.zeros_like(up).scatter(1, index, up.gather(1, index).sign())
     v = torch.linalg.cross(nearest, up)
-    (x, y, z), cosine = v.unbind(1), (nearest * up).sum(1)
-    diagonal, zero = cosine[:, None, None] * torch.eye(3, dtype=up.dtype, device=up.device), torch.zeros_like(x)
+    (x, y, z) = v.unbind(1)
+    cosine = (nearest * up).sum(1)
+    diagonal = cosine[:, None, None] * torch.eye(3, dtype=up.dtype, device=up.device)
+    zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).unflatten(1, (3, 3))
     return diagonal + cross + v[:, :, None] * (v / (1.0 + cosine[:, None]))[:, None]
 
@@ -181,7 +183,8 @@ def imu_pose(log: Log, robot: Robot) -> tuple[Rotation, Array]:
         raise UnknownNameError(log.source, "imu_frame", log.imu_frame, _links_on_base(robot))
     body, T_base_imu = robot.links[log.imu_frame]
     while (joint := robot.bodies[body].joint) is not None and joint.kind == "fixed":  # a sensor's weld does not move
-        body, T_base_imu = joint.parent, joint.T_parent_joint @ joint.T_joint_link @ T_base_imu
+        body = joint.parent
+        T_base_imu = joint.T_parent_joint @ joint.T_joint_link @ T_base_imu
     if body != 0:
         found = f"'{log.imu_frame}', which moves with {robot.bodies[body].name}"
         raise LogError(log.source, "imu_frame", found, f"a frame on the base: {', '.join(_links_on_base(robot)[:8])}")
@@ -202,11 +205,14 @@ def _from_imu(log: Log, robot: Robot, quat: Tensor | None) -> BaseMotion:
 _JOINTS = ("joint_position", "joint_velocity", "joint_acceleration")
 _TURNING = ("base_quat_xyzw", "base_angular_velocity_base", "base_angular_acceleration_base")
 _LINEAR = ("base_position_world", "base_linear_velocity_world", "base_linear_acceleration_world")
-_GYRO, _ACCELEROMETER = ("imu_angular_velocity", "imu_angular_acceleration"), ("imu_specific_force",)
+_GYRO = ("imu_angular_velocity", "imu_angular_acceleration")
+_ACCELEROMETER = ("imu_specific_force",)
 _ANGLE, _OMEGA, _ALPHA, _FORCE = (slice(3 * k, 3 * k + 3) for k in range(4))  # of the base's 12 quantities
 
 # of splitmix64, as signed numbers: a hash of which every bit looks random
-_GOLDEN, _FIRST, _SECOND = -0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15
+_GOLDEN = -0x61C8864680B583EB
+_FIRST = -0x40A7B892E31B1A47
+_SECOND = -0x6B2FB644ECCEEE15
 _BITS = 48  # taken of each hash
 _TICK = 1e-5  # [s] of stamps, whose last bits differ between formats of files
 
@@ -235,7 +241,8 @@ class MotionNoise:
         """
         count = self.joints.shape[0]
         side = size * random_sides(time, 3 * count + len(self.base))
-        joints, base = self.joints.to(side), self.base.to(side)
+        joints = self.joints.to(side)
+        base = self.base.to(side)
         of_joints = torch.einsum("jkl,bjl->kbj", joints, side[:, : 3 * count].unflatten(1, (count, 3)))
         return of_joints, side[:, 3 * count :] @ base.T
 
@@ -329,7 +336,8 @@ def random_sides(time: Tensor, count: int) -> Tensor:
 
     Source: splitmix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
     """
-    stamp, bits = (time.double() / _TICK).round().long(), torch.arange(_BITS, device=time.device)
+    stamp = (time.double() / _TICK).round().long()
+    bits = torch.arange(_BITS, device=time.device)
     words = []
     for _ in range(-(-count // _BITS)):
         stamp = stamp + _GOLDEN
@@ -351,7 +359,9 @@ def _shift(x: Tensor, bits: int) -> Tensor:
 
 def _turned(quat_xyzw: Tensor, angle: Tensor) -> Tensor:
     """Rotations (B, 4) after small ones (B, 3) about their own axes."""
-    axis, w, half = quat_xyzw[:, :3], quat_xyzw[:, 3:], 0.5 * angle
+    axis = quat_xyzw[:, :3]
+    w = quat_xyzw[:, 3:]
+    half = 0.5 * angle
     vector = axis + w * half + torch.linalg.cross(axis, half)
     return torch.nn.functional.normalize(torch.cat([vector, w - (axis * half).sum(1, keepdim=True)], dim=1), dim=1)
 

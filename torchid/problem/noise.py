@@ -39,14 +39,17 @@ from torchid.problem.samples import Samples
 from torchid.rounding import MAD_PER_STD, RANK_TOLERANCE, is_significant
 from torchid.sensing.sensors import measured_components
 
-_SAMPLES, _BYTES, _CHUNK = 1000, 2**27, 256  # rows in memory: 1000 samples give a standard deviation to 2 to 3 %
+_SAMPLES = 1000
+_BYTES = 2**27
+_CHUNK = 256  # rows in memory: 1000 samples give a standard deviation to 2 to 3 %
 CLIP = 3.0
 """Robust standard deviations at which residuals, of impacts for instance, are clipped."""
 
 
 def noise_of_sensors(builder: RowBuilder) -> dict[str, float]:
     """Standard deviation of every group that a builder's sensors have, in `NoiseGroups`' order [N m, N]."""
-    names, values = set(builder.noise_sources), builder.noise_groups.values(builder.sensors.noise)
+    names = set(builder.noise_sources)
+    values = builder.noise_groups.values(builder.sensors.noise)
     return {name: value for name, value in values.items() if name in names}
 
 
@@ -134,7 +137,8 @@ class SampledRows:
 
     def _unit_forces(self, samples: Samples) -> Tensor:
         """Generalized force of a unit of each noise source, (B, E, n_rows)."""
-        builder, base = self.builder, self.builder.tree.base_rows
+        builder = self.builder
+        base = self.builder.tree.base_rows
         n_rows = builder.tree.n_rows
         unit = torch.eye(n_rows, dtype=samples.time.dtype, device=samples.time.device)
         forces = [unit[:base].expand(len(samples), -1, -1)]
@@ -173,13 +177,16 @@ class SampledRows:
 
         def factor_of(chunk: SampledChunk) -> TriangularFactor:
             chunk = self.whiten(chunk, variance)
-            rows, present = chunk.rows, chunk.sources.abs().sum(1) > 0.0
-            readings, root = chunk.sources.square().sum(2), rows.new_ones(len(rows))
+            rows = chunk.rows
+            present = chunk.sources.abs().sum(1) > 0.0
+            readings = chunk.sources.square().sum(2)
+            root = rows.new_ones(len(rows))
             if columns is not None:
                 size = torch.linalg.vector_norm(rows[..., :-1] @ columns[chunk.log] - rows[..., -1], dim=1)
                 limit = _radius(present.sum(1))
                 weight = (limit / size).clamp_max(1.0)
-                root, readings = weight.sqrt(), readings * weight[:, None]
+                root = weight.sqrt()
+                readings = readings * weight[:, None]
             factor = TriangularFactor(self.builder.width)
             for support, slots in supports(rows).items():
                 weighted = rows[:, torch.tensor(slots)[:, None], torch.tensor([*support, self.builder.width])]
@@ -206,9 +213,11 @@ def noise_root(sources: Tensor) -> Tensor:
 
 def _sources_of_scales(builder: RowBuilder) -> dict[int, list[int]]:
     """Numbers of the sources of noise of readings with an unknown scale, by its column."""
-    base, torque = builder.tree.base_rows, np.asarray(builder.sensors.torque)
+    base = builder.tree.base_rows
+    torque = np.asarray(builder.sensors.torque)
     components = measured_components(builder.contacts, builder.sensors)
-    dofs, places = base + np.cumsum(torque) - 1, base + torque.sum() + np.cumsum(components).reshape(-1, 6) - 1
+    dofs = base + np.cumsum(torque) - 1
+    places = base + torque.sum() + np.cumsum(components).reshape(-1, 6) - 1
     return {
         column: [*(int(dofs[dof]) for dof in extra.dofs), *(int(places[at]) for at in extra.contacts if components[at])]
         for column, extra in enumerate(builder.extras, builder.columns.count)
@@ -236,7 +245,8 @@ def _random_chunks(
 
     Of filtered logs at most four for every independent sample: more would add little.
     """
-    rng, share = np.random.default_rng(0), min(1.0, most / max(sum(map(len, logs)), 1))
+    rng = np.random.default_rng(0)
+    share = min(1.0, most / max(sum(map(len, logs)), 1))
     for log in logs:
         count = min(len(log), max(round(min(share, 4.0 / log.oversampling) * len(log)), 1))
         index = torch.from_numpy(np.sort(rng.choice(len(log), count, replace=False)))
@@ -247,7 +257,8 @@ def _random_chunks(
             yield chosen[where], state
 
 
-_LEAST, _MOST = 1e-4, 1e3  # variance of the logarithms: deviations are 0.5 % apart, or anything
+_LEAST = 1e-4
+_MOST = 1e3  # variance of the logarithms: deviations are 0.5 % apart, or anything
 _POINTS = 41
 _HELD_OTHERS = 1e-6  # share of the information on other variances that is added to it: some may have none
 
@@ -280,9 +291,11 @@ def prior_precision(logarithms: Array, information: Array, score: Array) -> Arra
     count = len(logarithms)
     values, Q = np.linalg.eigh(information)
     kept = values > RANK_TOLERANCE * max(values[-1], np.finfo(float).tiny)
-    values, Q = values[kept], Q[:, kept]
+    values = values[kept]
+    Q = Q[:, kept]
     root = np.sqrt(values)
-    y, mean = Q.T @ (information @ logarithms + score) / root, root * Q.sum(0)
+    y = Q.T @ (information @ logarithms + score) / root
+    mean = root * Q.sum(0)
 
     def deviance(log_spread: float) -> float:
         variance = 1.0 + np.exp(log_spread) * values
@@ -292,7 +305,8 @@ def prior_precision(logarithms: Array, information: Array, score: Array) -> Arra
 
     grid = np.linspace(np.log(_LEAST), np.log(_MOST), _POINTS)
     best = int(np.argmin([deviance(x) for x in grid])) if len(values) > 1 else 0
-    low, high = grid[max(best - 1, 0)], grid[min(best + 1, _POINTS - 1)]
+    low = grid[max(best - 1, 0)]
+    high = grid[min(best + 1, _POINTS - 1)]
     spread = scipy.optimize.minimize_scalar(deviance, bounds=(low, high), method="bounded").x if best else grid[0]
     return (np.eye(count) - 1.0 / count) / float(np.exp(spread))
 
@@ -308,7 +322,8 @@ _SMALLEST = 1e-3
 _LEFT = 0.1  # least share of the residual's degrees of freedom that a group is assigned
 _FEW = 20.0  # least number of independent readings: a standard deviation to 16 %
 _NEGLIGIBLE = 1e-9  # share of a source's variance in the rows below which it is projected out
-_STEADY, _STEPS = 0.01, 40  # relative change of the noise along the directions of any group; most steps
+_STEADY = 0.01
+_STEPS = 40  # relative change of the noise along the directions of any group; most steps
 _CONFOUNDED = 0.5  # relative standard error of a standard deviation
 _POOLED = 0.5  # share of the prior in what determines a variance
 
@@ -336,7 +351,8 @@ class GroupVariances:
     @classmethod
     def unknown(cls, count: int) -> GroupVariances:
         """As stated, of residuals that tell nothing."""
-        none, ones = np.zeros(count, dtype=bool), np.ones(count)
+        none = np.zeros(count, dtype=bool)
+        ones = np.ones(count)
         return cls(ones, share=ones, estimated=none, error=ones, pooled=none, change=0.0)
 
     @property
@@ -428,13 +444,16 @@ class VarianceComponentEstimator:
             Precision of the logarithms of the variances, (G, G), zero of all others; its part of the equations
             M x = q, with x the factors of the variances: (G, G) and (G,).
         """
-        count, oversampling = len(variance), self.rows.oversampling
+        count = len(variance)
+        oversampling = self.rows.oversampling
         information = self._information(M, remaining)
         score = remaining * (q - M.sum(1)) / (2.0 * oversampling)
         logarithms = np.log(np.square(self.rows.reference_std) * variance)
-        precision, weight = np.zeros((count, count)), np.zeros((count, count))
+        precision = np.zeros((count, count))
+        weight = np.zeros((count, count))
         for index in self._alike:
-            known, places = information_about(index, information, score), np.ix_(index, index)
+            known = information_about(index, information, score)
+            places = np.ix_(index, index)
             precision[places] = prior_precision(logarithms[index], *known)
             weight[places] = 2.0 * oversampling / remaining[index].mean() * precision[places]  # 0 along equal factors
         return precision, weight, -weight @ logarithms
@@ -442,8 +461,10 @@ class VarianceComponentEstimator:
     def _step(self, M: Array, q: Array, estimated: np.ndarray) -> Array:
         """Factors of the unknown variances at which the squares are the expected ones; confounded ones stay near 1."""
         B = self._blocks
-        M, q = B.T @ M @ B, B.T @ q
-        free, held = np.flatnonzero(estimated), _HELD * np.diag(M)
+        M = B.T @ M @ B
+        q = B.T @ q
+        free = np.flatnonzero(estimated)
+        held = _HELD * np.diag(M)
         if not len(free):
             return np.ones(len(q))
         rhs = (q - M[:, ~estimated].sum(1) + held)[free]
@@ -459,15 +480,19 @@ class VarianceComponentEstimator:
         self, residuals: Sequence[Tensor], remaining: Array, variance: Array
     ) -> tuple[Array, Array, Array, Array]:
         """M (G, G), q (G,) of the equations M x = q; variance in the rows and number of readings by group, (G,)."""
-        group_of, count = self.rows.group_of, len(variance)
-        index, scale = torch.from_numpy(group_of), torch.from_numpy(np.sqrt(variance)[group_of])
+        group_of = self.rows.group_of
+        count = len(variance)
+        index = torch.from_numpy(group_of)
+        scale = torch.from_numpy(np.sqrt(variance)[group_of])
 
         def of_chunk(number: int) -> tuple[Tensor, Tensor, Tensor]:
-            chunk, r = self.rows.chunks[number], residuals[number]
+            chunk = self.rows.chunks[number]
+            r = residuals[number]
             sources = scale[:, None] * chunk.sources
             both = torch.cat([sources.mT, r[..., None]], dim=2)
             solved = torch.linalg.solve_triangular(noise_root(sources), both, upper=False)
-            white, y = solved[..., :-1], solved[..., -1:]  # (B, n_rows, E), (B, n_rows, 1)
+            white = solved[..., :-1]
+            y = solved[..., -1:]  # (B, n_rows, E), (B, n_rows, 1)
             M = torch.zeros(count, count, dtype=torch.float64)
             M.index_put_((index[:, None], index), (white.mT @ white).square().sum(0), accumulate=True)
             return M, white.square().sum(1), (white.mT @ y)[..., 0]
@@ -477,9 +502,11 @@ class VarianceComponentEstimator:
         size, score = (torch.cat([part[k] for part in parts]).numpy() for k in (1, 2))
         q, t, n = (np.zeros(count) for _ in range(3))
         for group in range(count):
-            sizes, scores = size[:, group_of == group], score[:, group_of == group]
+            sizes = size[:, group_of == group]
+            scores = score[:, group_of == group]
             present = sizes > _NEGLIGIBLE
-            t[group], n[group] = sizes.sum(), present.sum()
+            t[group] = sizes.sum()
+            n[group] = present.sum()
             if present.any():
                 q[group] = t[group] * _clipped_variance(scores[present] / np.sqrt(sizes[present]), sizes[present])
         return M.numpy(), q / remaining, t, n
@@ -493,7 +520,8 @@ class VarianceComponentEstimator:
             The residuals; the share of each group's degrees of freedom that remains after the fit, (G,); its number of
             independent readings, (G,).
         """
-        rows, group_of = self.rows, self.rows.group_of
+        rows = self.rows
+        group_of = self.rows.group_of
         leverages, size, readings = (np.zeros(len(variance)) for _ in range(3))
 
         def of_chunk(chunk: SampledChunk) -> tuple[Tensor, Tensor, Tensor]:
@@ -518,7 +546,8 @@ class VarianceComponentEstimator:
 
 def _forces(rows: SampledRows) -> Array:
     """Rms of what the sources of each group read, (G,), in their stated noise; of all rows where that is nothing."""
-    squares, sizes = np.zeros(len(rows.groups)), np.zeros(len(rows.groups))
+    squares = np.zeros(len(rows.groups))
+    sizes = np.zeros(len(rows.groups))
     for chunk in rows.chunks:
         size = chunk.sources.square().sum(2)
         along = torch.einsum("ber,br->be", chunk.sources, chunk.rows[..., -1]).square() / size.clamp_min(_NEGLIGIBLE)

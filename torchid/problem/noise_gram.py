@@ -39,7 +39,8 @@ combination. Less is taken off, and the nominal parameters make up for what is t
 """
 
 _MOST_SIGNAL = 2.0  # beyond, it is rounding, of combinations that the rows hardly determine
-_LEAST_PERTURBED, _MOST_PERTURBED = 5000, 20_000  # samples of all logs, evenly spread, see `_perturbed`
+_LEAST_PERTURBED = 5000
+_MOST_PERTURBED = 20_000  # samples of all logs, evenly spread, see `_perturbed`
 _NEGLIGIBLE = 1e-5  # share of noise in any combination: far below all standard errors
 _COPIES = 3  # of each sample, see `_copies`
 _RESOLVED = 1e-5  # least singular value, of columns of unit size, along which a difference of squares is no rounding
@@ -119,7 +120,8 @@ def estimate_noise_gram(logs: Sequence[Samples], builder: RowBuilder) -> dict[Pa
     total: dict[PartKey, NoiseGram] = {}
     if not by_log:
         return total
-    reduce, chunk = partial(_noise_gram_of_chunks, builder), chunk_size(builder.device) // _COPIES
+    reduce = partial(_noise_gram_of_chunks, builder)
+    chunk = chunk_size(builder.device) // _COPIES
     for of_worker in map_chunks(list(map(join_pieces, by_log.values())), builder, reduce, chunk):
         for key, noise_gram in of_worker.items():
             halves = {support: x.cpu().triu() for support, x in noise_gram.items()}
@@ -172,7 +174,8 @@ def _noise_gram_of_chunks(
 ) -> dict[PartKey, NoiseGram]:
     """By part: half of what pairs of samples with noise have more."""
     out: dict[PartKey, NoiseGram] = {}
-    workspace, scales = builder.workspaces.take(), set(scale_columns(builder))
+    workspace = builder.workspaces.take()
+    scales = set(scale_columns(builder))
     for samples, state in chunks:
         spans = PartKey.spans(samples, state)
         if scales:
@@ -191,7 +194,8 @@ def _noise_gram_of_chunks(
         perturbed = repeated.perturbed(noise, side.to(samples.time)[:, None])
         for rows, index in builder.blocks(perturbed, state, workspace):
             for key, start, end in spans:
-                sums, second = out.setdefault(key, {}), 2 * start + end
+                sums = out.setdefault(key, {})
+                second = 2 * start + end
                 for weight, (first, last) in (
                     (-1.0, span_of_samples(index, 3 * start, second)),
                     (0.5, span_of_samples(index, second, 3 * end)),
@@ -247,31 +251,34 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
         factor: of some rows.
         prior: of the parameters in its columns.
     """
-    R, noise_gram = factor.triangle().numpy(), factor.whole_noise_gram(prior.reading_noise).numpy()
+    R = factor.triangle().numpy()
+    noise_gram = factor.whole_noise_gram(prior.reading_noise).numpy()
     if not noise_gram.any():
         return CorrectedTriangle(R)
-    rows, rhs = R[:, :-1], R[:, -1]
-    size, scale = np.linalg.norm(rows, axis=0), column_scale(rows)
+    rows = R[:, :-1]
+    rhs = R[:, -1]
+    size = np.linalg.norm(rows, axis=0)
+    scale = column_scale(rows)
     U, values, Vh = np.linalg.svd(rows * scale, full_matrices=False)
     kept = is_significant(values, _RESOLVED)
     other = is_significant(values, RANK_TOLERANCE) & ~kept
     whitening = scale[:, None] * Vh[kept].T / values[kept]  # rows @ whitening has orthonormal columns
     noise = whitening.T @ noise_gram[:-1, :-1] @ whitening
     shares, turn = np.linalg.eigh(0.5 * (noise + noise.T))
-    along, of_forces, beyond = (
-        turn.T @ (U[:, kept].T @ rhs),
-        turn.T @ (whitening.T @ noise_gram[:-1, -1]),
-        U[:, other].T @ rhs,
-    )
+    along = turn.T @ (U[:, kept].T @ rhs)
+    of_forces = turn.T @ (whitening.T @ noise_gram[:-1, -1])
+    beyond = U[:, other].T @ rhs
     of_noise = np.square(along) @ np.minimum(shares, 1.0) - 2.0 * along @ of_forces + noise_gram[-1, -1]
     spent = min((len(along) + len(beyond)) / max(factor.independent_rows, 1.0), 1.0)
     residual = np.square(rhs - U[:, kept] @ (turn @ along) - U[:, other] @ beyond).sum()
     possible = min(residual / ((1.0 - spent) * of_noise), 1.0) if spent < 1.0 and of_noise > 0.0 else 1.0
-    shares, of_forces = possible * shares, possible * of_forces
+    shares = possible * shares
+    of_forces = possible * of_forces
     scales = [column for column, size in prior.reading_noise.items() if size > 0.0]
     of_readings = noise_gram[scales, scales] @ np.square((whitening @ turn)[scales])
     bound, lacking = _bound_of_readings(shares, possible * of_readings)
-    shares, of_forces = bound * shares, bound * of_forces
+    shares = bound * shares
+    of_forces = bound * of_forces
     if np.abs(shares).max(initial=0.0) < _NEGLIGIBLE:
         return CorrectedTriangle(R, NoiseShares.of(shares))
     remaining_share = np.clip(1.0 - shares, LEAST_SIGNAL, _MOST_SIGNAL)
@@ -287,11 +294,13 @@ def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> Correcte
         np.append(np.zeros_like(size), residual)[None],
         np.zeros((len(R) - 1 - len(target) - len(beyond), R.shape[1])),
     ]
-    noise, triangle = NoiseShares.of(shares + lacking), np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
+    noise = NoiseShares.of(shares + lacking)
+    triangle = np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
     if not noise.lost:
         return CorrectedTriangle(triangle, noise)
     deviations = np.where(np.isin(range(len(best)), scales), np.maximum(np.abs(1.0 + best), 1.0), best)
-    shrinkage, count = ((remaining + lacking) / remaining_share)[:, None] * combinations, len(prior.nominal)
+    shrinkage = ((remaining + lacking) / remaining_share)[:, None] * combinations
+    count = len(prior.nominal)
     units = np.hstack([shrinkage[:, :count] @ prior.spread, shrinkage[:, count:] * deviations[count:]])
     return CorrectedTriangle(triangle, noise, whitening @ turn @ units)
 

@@ -172,7 +172,8 @@ class Samples:
 
     def motion(self) -> Motion:
         """The motion of these samples, for the regressor."""
-        base, zero = self.base, self.time.new_zeros(len(self), 3)
+        base = self.base
+        zero = self.time.new_zeros(len(self), 3)
         force = base.specific_force
         if force is None:  # of a fixed base
             force = torch.stack([zero[:, 0] - g for g in GRAVITY_WORLD], dim=1)
@@ -195,7 +196,8 @@ class Samples:
 
     def with_noise_alone(self, noise: SensorNoise) -> Samples:
         """The samples with readings that are noise of the forces alone, drawn as that of the motion is."""
-        torque, wrench = self.torque, self.wrench
+        torque = self.torque
+        wrench = self.wrench
         if torque is not None:
             std = torque.new_tensor(noise.dof_std(self.joint_position.shape[1], torque.shape[1]))
             torque = 0.0 * torque + std * random_sides(self.time, len(std))
@@ -211,8 +213,11 @@ class Samples:
         An orientation that was not measured is the identity: given the specific force, the dynamics do not depend on it
         either. A fixed base has joints only.
         """
-        q, v, a = self.joint_position, self.joint_velocity, self.joint_acceleration
-        base, zero = self.base, self.time.new_zeros(len(self), 3)
+        q = self.joint_position
+        v = self.joint_velocity
+        a = self.joint_acceleration
+        base = self.base
+        zero = self.time.new_zeros(len(self), 3)
         if base.specific_force is None or base.angular_velocity is None or base.angular_acceleration is None:
             return q, v, a
         quat = zero.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(self), 4) if base.quat_xyzw is None else base.quat_xyzw
@@ -331,7 +336,8 @@ def _contact_normals(
 
 def _wrenches(log: Log, contacts: Sequence[Contact], order: list[int]) -> FloatArray | None:
     """Wrenches of the contacts (N, C, 6), the force along the normal of those that are read along it; None without."""
-    wrench, scalar = log.contact_wrench, log.contact_force_normal
+    wrench = log.contact_wrench
+    scalar = log.contact_force_normal
     along = [contact.along_normal for contact in contacts]
     if not any(along) or wrench is None and scalar is None:
         return None if wrench is None else columns_in_order(wrench, order)
@@ -456,7 +462,8 @@ def is_at_rest(logs: Sequence[Samples]) -> bool:
 def _moves(log: Samples) -> bool:
     """Whether a joint of a filtered log travels, or its base turns or is shaken."""
     thin = log.every(max(1, len(log) // _MOST_SAMPLES))
-    position, base = thin.joint_position, thin.base
+    position = thin.joint_position
+    base = thin.base
     if position.shape[1] and float((position.amax(dim=0) - position.amin(dim=0)).max()) > MIN_MOTION:
         return True
     if base.quat_xyzw is not None:

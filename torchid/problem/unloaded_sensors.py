@@ -57,10 +57,12 @@ class UnloadedOffsetEquation:
         The scale's column holds the mean: the noise of single readings would bias the scale towards 0. The row is on
         the CPU, where readings in the air are, and so is the block of such rows in a factor.
         """
-        first, row = builder.columns.count, [1.0, self.mean]
+        first = builder.columns.count
+        row = [1.0, self.mean]
         columns: tuple[int, ...] = (first + self.offset,)
         if self.scale is not None:
-            columns, row = (*columns, first + self.scale), [1.0, -self.mean, self.mean]
+            columns = (*columns, first + self.scale)
+            row = [1.0, -self.mean, self.mean]
         return columns, torch.tensor([row], dtype=builder.tree.ancestors.dtype) / self.deviation
 
 
@@ -121,7 +123,8 @@ def zero_in_air(log: Log, contacts: Sequence[Contact]) -> Log:
     Warns:
         TorchidWarning: what was subtracted, by contact; channels that are masked in the air.
     """
-    wrench, scalar = log.contact_wrench, log.contact_force_normal
+    wrench = log.contact_wrench
+    scalar = log.contact_force_normal
     if log.contact_wrench_world is not None and not log.moments_about_world_origin:
         found = f"given with {_KEY}, though no offset is constant along the world's axes of a sensor that moves"
         accepted = f"{WRENCHES[0]} or {FORCE_NORMAL}; of force plates {POINTS}, or logs.columns.plates"

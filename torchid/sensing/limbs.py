@@ -46,7 +46,8 @@ def limb_null_space(
     Returns:
         W, (m, 6, B), and whether each sample is suspect, (B,): a limb is singular or nearly so, and its W worthless.
     """
-    m, samples = len(row_std), limbs[0].shape[-1]
+    m = len(row_std)
+    samples = limbs[0].shape[-1]
     white = row_std.new_empty(m + len(J_m), BASE, samples)  # what the columns of V do to each reading, by its noise
     suspect = torch.zeros(samples, dtype=torch.bool, device=white.device)
     for k in dict.fromkeys(len(limb) for limb in limbs):
@@ -54,7 +55,8 @@ def limb_null_space(
         motion, condition = _solve([limbs[number] for number in alike])
         suspect |= ~(condition < WELL_CONDITIONED**2)  # so written, undefined ones are suspect too
         white[BASE:m].index_copy_(0, torch.cat([joints[number] for number in alike]), motion)
-    base, of_joints = white[:BASE], white[BASE:m]
+    base = white[:BASE]
+    of_joints = white[BASE:m]
     for row, J, std in zip(white[m:], J_m, wrench_std, strict=True):
         row[:] = std * ((J[BASE:, None] * of_joints).sum(0) + J[:BASE])
     of_joints *= row_std[BASE:, None, None]
@@ -83,7 +85,8 @@ def _orthonormalize(columns: Tensor, suspect: Tensor) -> None:
     """
     least = PIVOT * columns.square().sum(0)
     for j in range(columns.shape[1]):
-        column, later = columns[:, j], columns[:, j + 1 :]
+        column = columns[:, j]
+        later = columns[:, j + 1 :]
         size = column.square().sum(0)
         suspect |= ~(size > least[j])
         column *= size.rsqrt_()
@@ -99,7 +102,8 @@ def _solve(limbs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     X = torch.stack(list(limbs))
     size = X[:, :, BASE:].square().sum((1, 2))
     for done, column in enumerate(reversed(range(BASE + 1, BASE + k))):
-        v, earlier = X[:, done:, column].clone(), X[:, done:, :column]
+        v = X[:, done:, column].clone()
+        earlier = X[:, done:, :column]
         length = torch.copysign((v * v).sum(1).sqrt_(), v[:, 0])
         v[:, 0] += length
         along = _sum_of_products(v[:, :, None].unbind(1), earlier.unbind(1))

@@ -98,7 +98,8 @@ class Projection(nn.Module):
 
     def extra_repr(self) -> str:
         """What `repr` says."""
-        torque, wrench = self.get_buffer("torque_measured"), self.get_buffer("wrench_measured")
+        torque = self.get_buffer("torque_measured")
+        wrench = self.get_buffer("wrench_measured")
         measured = f"{int(torque.sum())} of {len(torque)} torques, {int(wrench.sum())} of {len(wrench)} of contacts"
         return f"measured: {measured}"
 
@@ -124,7 +125,8 @@ class Projection(nn.Module):
         if active.shape[1]:
             states, which = torch.unique(active, dim=0, return_inverse=True)
         else:
-            states, which = active[:1], torch.zeros(len(active), dtype=torch.int64, device=active.device)
+            states = active[:1]
+            which = torch.zeros(len(active), dtype=torch.int64, device=active.device)
         for number, state in enumerate(states):
             index = torch.nonzero(which == number)[:, 0]
             groups += self._state(index, state, J_C[index], K[index], torque[index], wrench[index])
@@ -136,8 +138,11 @@ class Projection(nn.Module):
             if not isinstance(x, Tensor):
                 raise TypeError(f"{name}: found {type(x).__name__}; accepted: a tensor")
         found = [tuple(x.shape) for x in batch.values()]
-        rows, k, K = len(self.get_buffer("kept")), len(self.get_buffer("wrench_measured")), batch["K"]
-        B, n = found[0][:1], rows - self.base_rows
+        rows = len(self.get_buffer("kept"))
+        k = len(self.get_buffer("wrench_measured"))
+        K = batch["K"]
+        B = found[0][:1]
+        n = rows - self.base_rows
         if K.ndim != 3 or found != [(*B, k, rows), (*B, k), (*B, rows, K.shape[2]), (*B, n), (*B, k)]:
             accepted = f"(B, {k}, {rows}), (B, {k}), (B, {rows}, P), (B, {n}), (B, {k})"
             raise ValueError(f"{', '.join(batch)}: found shapes {', '.join(map(str, found))}; accepted: {accepted}")
@@ -150,7 +155,8 @@ class Projection(nn.Module):
     def _state(
         self, index: Tensor, state: Tensor, J: Tensor, K: Tensor, torque: Tensor, wrench: Tensor
     ) -> list[ProjectedGroup]:
-        kept, measured = self.get_buffer("kept"), self.get_buffer("wrench_measured") & state
+        kept = self.get_buffer("kept")
+        measured = self.get_buffer("wrench_measured") & state
         J_m = J[:, measured]
         f = torch.zeros_like(K[:, :, 0])
         f[:, self.base_rows :] = torch.where(self.get_buffer("torque_measured"), torque, torch.zeros_like(torque))

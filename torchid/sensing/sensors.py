@@ -13,7 +13,8 @@ from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 
-_FORCES, _MOMENTS = (0, 1, 2), (3, 4, 5)
+_FORCES = (0, 1, 2)
+_MOMENTS = (3, 4, 5)
 CONTACT_TYPES = ("point", "line", "flat")
 NORMAL_FORCE = "fn"
 """Name of the component that a scalar sensor of a contact reads."""
@@ -240,7 +241,8 @@ def named_sensors(name: str, n: int, contacts: int, noise: SensorNoise | None = 
     """
     if name not in NAMED_SETS:
         raise SensorError("sensors", "name", f"'{name}'", f"{', '.join(NAMED_SETS)}, or a mapping of sensors")
-    torque, wrench = name in ("full", "joints"), name in ("full", "contacts")
+    torque = name in ("full", "joints")
+    wrench = name in ("full", "contacts")
     torques = np.append(np.full(n, torque), np.zeros(6 * ft, dtype=bool))
     return SensorSet(torques, np.full((contacts, 6), wrench), noise or SensorNoise())
 
@@ -347,7 +349,8 @@ def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_worl
 
 def minimized_errors(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> str:
     """What a fit with some sensors minimizes, in words: errors of which forces, and what they are free of."""
-    torque, measured = sensors.torque[: robot.n], measured_components(contacts, sensors)
+    torque = sensors.torque[: robot.n]
+    measured = measured_components(contacts, sensors)
     rows = ["joint torques"] * bool(torque.any()) + ["base forces"] * (not robot.fixed_base)
     rows += ["wrenches in limbs"] * bool(sensors.torque[robot.n :].any())
     makers = ["force in a closed loop"] * bool(robot.loops)
