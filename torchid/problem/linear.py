@@ -373,7 +373,10 @@ class TriangularFactor:
         if numbers <= (self.columns + 1) * (self.columns + 2) // 2:
             return self.to_cpu()
         every = tuple(range(self.columns))
-        noise_gram = {support: x for support, x in self.noise_gram.items() if len(support) == 1}
+        noise_gram = dict(self.noise_gram)
+        for support in self.noise_gram:
+            if len(support) != 1:
+                del noise_gram[support]
         if len(noise_gram) < len(self.noise_gram):
             noise_gram[every] = self.whole_noise_gram(dict.fromkeys(every, 0.0))
         return replace(self, blocks={every: self.triangle().triu()}, noise_gram=noise_gram)
