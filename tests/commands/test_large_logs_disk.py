@@ -35,7 +35,7 @@ from torchid.config import load_config
 from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import set_up
 from torchid.logs.blocks import log_bytes, open_log_blocks
-from torchid.logs.lazy_arrays import Spill, SpillError
+from torchid.logs.spill import Spill, SpillError
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.metrics import calibrate_readings
 from torchid.reading.log_reader import LogReader
@@ -121,7 +121,7 @@ def test_a_table_takes_one_file_for_each_field_however_many_batches_it_is_read_i
     pq.write_table(pq.read_table(tmp_path / "log.parquet"), tmp_path / "log.parquet", row_group_size=100)
     with open_log_blocks(tmp_path / "log.parquet", tmp_path) as blocks:
         assert len(blocks) == 2_000
-        assert len(made_in) == 1 + len(blocks.fields), "time too"
+        assert len(made_in) == 1 + len(blocks.row_shapes), "time too"
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")

@@ -30,7 +30,7 @@ def mapped_arrays(folder: Path, text: str, **arrays: Any) -> Log:
     path, columns = folder / "x.npz", Columns(**yaml.safe_load(text))
     np.savez(path, **({"time": np.array(TIME), "q": np.arange(6.0).reshape(3, 2)} | arrays))
     log = read_log(path, columns=columns)
-    with open_log_blocks(path, None, columns) as blocks:
+    with open_log_blocks(path, path.parent, columns) as blocks:
         for field, values in blocks.read(slice(1, 3)).arrays().items():
             np.testing.assert_array_equal(values, log.arrays()[field][1:])
     return log

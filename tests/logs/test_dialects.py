@@ -37,14 +37,11 @@ def test_a_dialect_is_the_log_it_was_written_from(tmp_path: Path, recorded: Log,
 
 
 @each
-@pytest.mark.parametrize("on_disk", [False, True])
-def test_blocks_of_a_dialect_are_its_samples_to_the_bit(
-    tmp_path: Path, recorded: Log, dialect: str, on_disk: bool
-) -> None:
+def test_blocks_of_a_dialect_are_its_samples_to_the_bit(tmp_path: Path, recorded: Log, dialect: str) -> None:
     name, text, write = DIALECTS[dialect]
     path, columns = write(tmp_path / name, recorded), parsed_map(text)
     whole = read_log(path, columns=columns)
-    with open_log_blocks(path, tmp_path if on_disk else None, columns) as blocks:
+    with open_log_blocks(path, tmp_path, columns) as blocks:
         assert len(blocks) == len(whole)
         for samples in (slice(0, 40), slice(40, 41), slice(41, 150)):
             part, expected = blocks.read(samples), whole.select(samples)

@@ -336,7 +336,7 @@ def test_arrays_of_one_file_that_have_stamps_of_their_own_are_those_of_two_files
         assert np.abs(found.imu_specific_force - np.sin(7.0 * found.time[:, None] + np.arange(3))).max() < 1e-9
     with (
         pytest.raises(LogError, match="stamps beside those of time \\('imu/stamp_us'\\), read whole"),
-        open_log_blocks(tmp_path / "one.npz", None, columns),
+        open_log_blocks(tmp_path / "one.npz", tmp_path, columns),
     ):
         pass
 

@@ -71,7 +71,7 @@ def test_arrays_may_have_the_motors_that_are_not_used(tmp_path: Path, width: int
     again = read_log(tmp_path / "x.npz", columns=columns)
     np.testing.assert_array_equal(again.joint_position, log.joint_position)
     np.testing.assert_array_equal(again.joint_torque, log.joint_torque)
-    with open_log_blocks(tmp_path / "x.npz", None, columns) as blocks:
+    with open_log_blocks(tmp_path / "x.npz", tmp_path, columns) as blocks:
         np.testing.assert_array_equal(blocks.read(slice(7, 9)).joint_position, log.joint_position[7:9])
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from torchid.log_checks import Checked
 from torchid.log_checks.check import check
 from torchid.logs import Columns, Log, Topics, read_log, write_log
 from torchid.logs.blocks import has_blocks, open_log_blocks
-from torchid.logs.containers import atomic_output, new_log_kind
+from torchid.logs.containers import LogKind, atomic_output, existing_log_kind, new_log_kind
 from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.time_range import log_title, split_range
 from torchid.reading.log_reader import apply_contact_settings, memory_needed, setup_of_log
@@ -183,12 +184,13 @@ def recorded_segments(
     path: Path, logs: LogsConfig, settings: PreprocessingConfig, allow_gaps: bool = True
 ) -> Iterator[LogSegment]:
     """As `segments_to_check`, of a log of any size."""
-    if settings.bridge_gaps_s is not None or not has_blocks(path, logs.columns):
+    is_whole = settings.bridge_gaps_s is not None or not has_blocks(path, logs.columns)
+    if is_whole or existing_log_kind(path) is LogKind.TABLE:
         log = _read_with_gaps(path, logs, settings)
         for segment in _segments(len(log)):
             yield LogSegment(log.select(segment), _segment_name(path, segment, len(log)), len(log))
         return
-    with open_log_blocks(path, None, logs.columns, settings.needs_flags) as blocks:
+    with open_log_blocks(path, Path(gettempdir()), logs.columns, settings.needs_flags) as blocks:
         for segment in _segments(len(blocks)):
             with about_file(path):
                 log = blocks.read(segment, allow_gaps)

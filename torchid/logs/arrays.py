@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, excerpt, is_plain
 from torchid.guards import MAX_LETTERS
-from torchid.logs.lazy_arrays import LazyArray
 from torchid.logs.log import SHAPES, check_shape
 
 
@@ -44,89 +43,76 @@ def parse_frame(name: str, array: NDArray[Any]) -> str:
     return parse_names(name, array.reshape(1))[0]
 
 
-_COLUMNS = re.compile(r"(.+)\[(\d*):(\d*)\]")
-_FIELD = re.compile(r"(.+)\['([^'\[\]]+)'\]")
+ARRAY_ACCEPTED = "a plain array of numbers, truth values or text"
+"""Accepted where the reader of a file fails at an array."""
+
 TRANSPOSED = ".T"
 """Behind the name of an array whose columns are the samples."""
 
-_TRANSPOSED = re.compile(rf"(.+){re.escape(TRANSPOSED)}")
+_PART = re.compile(r"(?P<array>.+)(?:\[(?P<first>\d*):(?P<last>\d*)\]|\['(?P<field>[^'\[\]]+)'\]|\.T)")
+"""What a name may mean of another array: some columns, a field of records, or the transposed array."""
 
 AnyArray = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class _Part:
-    """What a name means of another array: some columns, a field of records, or the transposed array.
+def _split_parts(name: str, given: Collection[str]) -> tuple[str, list[re.Match[str]]]:
+    """The array of a file that a name means a part of, and the parts of parts, the largest first."""
+    parts = list[re.Match[str]]()
+    while name not in given and (part := _PART.fullmatch(name)) is not None:
+        parts.insert(0, part)
+        name = part["array"]
+    return name, parts
 
-    Attributes:
-        text: the name.
-        of: name of the other array, or part.
-        columns: first and last of `[3:7]`.
-        field: of `['q']`.
+
+def _part_of(array: AnyArray, part: re.Match[str]) -> AnyArray:
+    """The part of an array; LogError where it has none."""
+    by_samples = f"an array of shape ({', '.join(map(str, ('N', *array.shape[1:])))})"
+    if (field := part["field"]) is not None:
+        fields = array.dtype.names
+        if field in (fields or ()):
+            return np.asarray(array[field])
+        accepted = f"fields of '{part['array']}': {', '.join(fields)}" if fields else "an array of records"
+        raise LogError.at_field(f"'{part[0]}'", "no such field" if fields else by_samples, accepted)
+    if part["first"] is None:
+        if array.ndim != 2:
+            raise LogError.at_field(f"'{part[0]}'", f"an array of {array.ndim} axes", "one of rows and columns")
+        return array.T
+    width = array.shape[1] if array.ndim > 1 else 0
+    start = int(part["first"] or 0)
+    stop = int(part["last"] or width)
+    if start >= stop or stop > width:
+        raise LogError.at_field(f"'{part[0]}'", by_samples, "columns that it has, counted from 0")
+    return np.asarray(array[:, start:stop])
+
+
+def load_part(name: str, given: Collection[str], load: Callable[[str], AnyArray]) -> AnyArray:
+    """An array of a file, or the part of one that a name of `with_parts` means.
+
+    Raises:
+        LogError: an array that has no such part.
     """
-
-    text: str
-    of: str
-    columns: tuple[str, str] | None = None
-    field: str | None = None
-
-    @classmethod
-    def of_name(cls, text: str) -> _Part | None:
-        """What a name means; None for one of an array as it is."""
-        if (match := _COLUMNS.fullmatch(text)) is not None:
-            return cls(text, match[1], columns=(match[2], match[3]))
-        if (match := _FIELD.fullmatch(text)) is not None:
-            return cls(text, match[1], field=match[2])
-        match = _TRANSPOSED.fullmatch(text)
-        return None if match is None else cls(text, match[1])
-
-    @property
-    def is_transposed(self) -> bool:
-        """Whether samples are the columns of the other array."""
-        return self.columns is None and self.field is None
-
-    def __call__(self, array: AnyArray) -> AnyArray:
-        """The part of an array, or of some of its rows."""
-        self.require(array.dtype, array.shape)
-        if self.columns is not None:
-            return np.asarray(array[:, self.slice(array.shape)])
-        return np.asarray(array.T if self.field is None else array[self.field])
-
-    def require(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-        """Make sure that an array has the part; LogError where it has not."""
-        by_samples = f"an array of shape ({', '.join(map(str, ('N', *shape[1:])))})"
-        if self.columns is not None:
-            self.slice(shape)
-        elif self.field is not None and self.field not in (dtype.names or ()):
-            accepted = f"fields of '{self.of}': {', '.join(dtype.names)}" if dtype.names else "an array of records"
-            raise LogError.at_field(f"'{self.text}'", "no such field" if dtype.names else by_samples, accepted)
-        elif self.is_transposed and len(shape) != 2:
-            raise LogError.at_field(f"'{self.text}'", f"an array of shape {shape}", "one of rows and columns")
-
-    def slice(self, shape: tuple[int, ...]) -> slice:
-        """The columns, of an array of a shape; LogError where it has not so many."""
-        first, last = self.columns or ("", "")
-        start, stop = int(first or 0), int(last) if last else None
-        width = shape[1] if len(shape) > 1 else 0
-        if start >= (width if stop is None else stop) or (stop or 0) > width:
-            found = f"an array of shape ({', '.join(map(str, ('N', *shape[1:])))})"
-            raise LogError.at_field(f"'{self.text}'", found, "columns that it has, counted from 0")
-        return slice(start, stop)
+    array_name, parts = _split_parts(name, given)
+    array = load(array_name)
+    for part in parts:
+        array = _part_of(array, part)
+    return array
 
 
-def _root(text: str, given: Collection[str]) -> str | None:
-    """The array of a file that a name means a part of, or the name itself; None where there is none."""
-    while text not in given:
-        if (part := _Part.of_name(text)) is None:
-            return None
-        text = part.of
-    return text
+def sample_axis(name: str, given: Collection[str]) -> tuple[str, int]:
+    """The array of a file that a name means a part of, and which of its axes counts samples, 0 or 1."""
+    array_name, parts = _split_parts(name, given)
+    return array_name, sum(part[0].endswith(TRANSPOSED) for part in parts) % 2
 
 
-_A = TypeVar("_A", bound=LazyArray)
+def with_parts(given: Sequence[str], wanted: Iterable[str]) -> list[str]:
+    """Names of arrays, those of which a map wants parts replaced by these."""
+    parts = defaultdict[str, dict[str, None]](dict)
+    for text in wanted:
+        parts[_split_parts(text, given)[0]][text] = None
+    return [text for name in given for text in parts.get(name, [name])]
 
 
-def require_plain(name: str, array: _A) -> _A:
+def require_plain(name: str, array: AnyArray) -> AnyArray:
     """The array itself; LogError for one of Python objects, which no reader of a log loads."""
     if array.dtype.hasobject:
         accepted = "plain arrays, one for each field: numpy.savez(path, time=..., q=...)"
@@ -140,51 +126,3 @@ def fields_of_records(name: str, array: AnyArray) -> Iterator[tuple[str, AnyArra
         yield name, array
     for field in array.dtype.names or ():
         yield from fields_of_records(f"{name}['{field}']", array[field])
-
-
-def with_parts(given: Sequence[str], wanted: Iterable[str]) -> list[str]:
-    """Names of arrays, those of which a map wants parts replaced by these."""
-    parts = dict[str, list[str]]()
-    for text in wanted:
-        if (root := _root(text, given)) is not None:
-            parts.setdefault(root, []).append(text)
-    return [text for name in given for text in dict.fromkeys(parts.get(name, [name]))]
-
-
-def load_part(name: str, given: Collection[str], load: Callable[[str], AnyArray]) -> AnyArray:
-    """An array of a file, or the part of one that a name of `with_parts` means.
-
-    Raises:
-        LogError: an array that has no such part.
-    """
-    if name in given or (part := _Part.of_name(name)) is None:
-        return load(name)
-    return part(load_part(part.of, given, load))
-
-
-class LazyPart:
-    """A part of an array that is read where it is sliced."""
-
-    def __init__(self, array: LazyArray, part: _Part) -> None:
-        """The part of an array that a name means; LogError where it has not so many columns."""
-        part.require(array.dtype, array.shape)
-        self._array, self._part = array, part
-        if part.is_transposed:
-            self.dtype, self.shape = array.dtype, array.shape[::-1]
-            return
-        example = part(np.empty((0, *array.shape[1:]), array.dtype))
-        self.dtype, self.shape = example.dtype, (array.shape[0], *example.shape[1:])
-
-    def __getitem__(self, rows: slice) -> AnyArray:
-        """Some rows; of a transposed array one of its own rows is read at a time."""
-        if not self._part.is_transposed:
-            return self._part(np.asarray(self._array[rows]))
-        of_rows = (np.asarray(self._array[k : k + 1])[0, rows] for k in range(self.shape[1]))
-        return np.stack(list(of_rows), axis=1)
-
-
-def lazy_part(name: str, given: Collection[str], lazy: Callable[[str], LazyArray]) -> LazyArray:
-    """As `load_part`, of arrays that are read where they are sliced."""
-    if name in given or (part := _Part.of_name(name)) is None:
-        return lazy(name)
-    return LazyPart(lazy_part(part.of, given, lazy), part)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, excerpt
-from torchid.logs.arrays import lazy_part, parse_names, require_plain
+from torchid.logs.arrays import ARRAY_ACCEPTED, load_part, parse_names, require_plain, sample_axis
 from torchid.logs.columns import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.force_plates import about_world_origin
 from torchid.logs.gaps import bridge_gaps
-from torchid.logs.lazy_arrays import LazyArray, Spill
 from torchid.logs.log import (
     NAME_FIELDS,
     SHAPES,
@@ -31,46 +31,15 @@ from torchid.logs.log import (
     to_float64,
 )
 from torchid.logs.read import build_log, check_fields_given
-from torchid.logs.schema import FileFields, match_arrays
+from torchid.logs.schema import match_arrays
+from torchid.logs.spill import Spill
 from torchid.logs.table_files import is_text_table
-from torchid.logs.tables import read_table, table_blocks, table_size
+from torchid.logs.tables import table_blocks, table_size
 from torchid.logs.time_range import split_range
 
 GIGABYTE = 1e9
 _WHOLE = "a larger preprocessing.memory_gb, or the file that torchid convert makes of it"
-_ACCEPTED = "a plain array of numbers, truth values or text"
 _BYTES_PER_LETTER = 4  # of a table: a cell has at least two characters, a number eight bytes
-
-
-class MappedArray:
-    """A field whose arrays are read where it is sliced."""
-
-    def __init__(self, fields: FileFields, name: str, arrays: Mapping[str, LazyArray]) -> None:
-        """The field of a name, of open arrays. Raises LogError: arrays that do not fit it."""
-        self._fields, self._name, self._arrays = fields, name, arrays
-        self._constant = fields.constant_sources(name)
-        for source in fields.sources_of(name):
-            if not arrays[source].shape:
-                raise LogError.at_field(f"'{source}'", "a single value", "an array with a row for each sample")
-        sampled = [source for source in fields.sources_of(name) if not self._is_constant(source)]
-        lengths = {source: arrays[source].shape[0] for source in sampled}
-        for source, length in lengths.items():
-            if length != max(lengths.values()):
-                raise LogError.at_field(f"'{source}'", f"{length} samples", f"{max(lengths.values())}, as others have")
-        first = self[slice(0, 1)]
-        self.dtype, self.shape = first.dtype, (max(lengths.values(), default=0), *first.shape[1:])
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        if self._name == "time" and self._fields.step is not None and hasattr(self, "shape"):
-            start, stop, _ = rows.indices(self.shape[0])
-            return self._fields.stamps(start, stop - start)
-        return self._fields.value(self._name, lambda source: self._read(source, rows))
-
-    def _read(self, source: str, rows: slice) -> NDArray[Any]:
-        return np.asarray(self._arrays[source][slice(None) if self._is_constant(source) else rows])
-
-    def _is_constant(self, source: str) -> bool:
-        return source in self._constant and len(self._arrays[source].shape) == 1
 
 
 def log_bytes(path: Path, limit: float) -> int:
@@ -109,14 +78,16 @@ class LogBlocks:
         source: the log's file name.
         names: arrays of text, by field.
         time: (N,) [s].
-        fields: all other fields with samples.
+        row_shapes: shape of a sample of every other field, by field.
+        read_rows: arrays of some samples (...) by field, texts too.
         first: number of its first sample in the fields, of a part of a log.
     """
 
     source: str
     names: Mapping[str, NDArray[Any]]
     time: FloatArray
-    fields: Mapping[str, LazyArray]
+    row_shapes: Mapping[str, tuple[int, ...]]
+    read_rows: Callable[[slice], dict[str, NDArray[Any]]]
     first: int = 0
 
     def __len__(self) -> int:
@@ -124,27 +95,24 @@ class LogBlocks:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of a sample."""
-        return 8 + sum(int(np.prod(x.shape[1:])) * x.dtype.itemsize for x in self.fields.values())
+        """Bytes of a sample of float64."""
+        return 8 + sum(8 * math.prod(shape) for shape in self.row_shapes.values())
 
     def read(self, samples: slice, allow_gaps: bool = False, bridge_gaps_s: float | None = None) -> Log:
         """Some samples as a log; `allow_gaps` and `bridge_gaps_s` as of `read_log`. Raises LogError: invalid values."""
-        rows = slice(self.first + samples.start, self.first + samples.stop)
-        raw = {**self.names, "time": self.time[samples]}
-        for name, array in self.fields.items():
-            with reader_errors_explained(name, _ACCEPTED):
-                raw[name] = np.asarray(array[rows])
+        raw = self.read_rows(slice(self.first + samples.start, self.first + samples.stop))
+        raw["time"] = self.time[samples]
         return build_log(bridge_gaps(about_world_origin(raw), bridge_gaps_s), allow_gaps)
 
 
 @contextmanager
 def open_log_blocks(
-    path: Path, folder: Path | None, columns: Columns | None = None, needs_flags: bool = True
+    path: Path, folder: Path, columns: Columns | None = None, needs_flags: bool = True
 ) -> Iterator[LogBlocks]:
-    """Open a log in one file (.h5, .npz or a table).
+    """Open a log in one file (.h5, .npz or a table), from which rows are read as any file in memory is.
 
-    Arrays of .h5 and .npz files are read in place unless these are compressed; others are unpacked to temporary files
-    in `folder`, or to memory without one. Of a part of a log no other samples are there.
+    Arrays of .h5 and .npz files are read in place unless these are compressed; others, and tables, are unpacked to
+    temporary files in `folder`. Of a part of a log no other samples are there.
 
     Args:
         path: of the log.
@@ -160,11 +128,11 @@ def open_log_blocks(
         with about_file(path):
             part = split_range(path)
             if existing_log_kind(part.file) is LogKind.TABLE:
-                names, fields = _open_table(part.file, folder, columns, needs_flags)
+                lengths, time, read_rows = _open_table(part.file, folder, columns, needs_flags)
             else:
                 container = stack.enter_context(open_container(part.file, whole=False))
-                names, fields = _open_arrays(container, folder, columns, needs_flags)
-            blocks = _check_blocks(str(path), names, fields)
+                lengths, time, read_rows = _open_arrays(container, folder, columns, needs_flags)
+            blocks = _check_blocks(str(path), lengths, time, read_rows)
             if part.range is not None:
                 samples = part.range.select(blocks.time)
                 blocks = replace(blocks, time=blocks.time[samples], first=samples.start)
@@ -172,78 +140,93 @@ def open_log_blocks(
         yield blocks
 
 
-def _open_arrays(
-    container: Container, folder: Path | None, columns: Columns | None, needs_flags: bool
-) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
-    """Text and arrays of a container."""
+_Opened = tuple[dict[str, int], NDArray[Any], Callable[[slice], dict[str, NDArray[Any]]]]
+"""Samples of each field of a file, its stamps, and what reads rows of all."""
 
-    def load(name: str) -> NDArray[Any]:
-        with reader_errors_explained(name, _ACCEPTED):
-            return require_plain(name, container.load(name))
 
-    def lazy(name: str) -> LazyArray:
-        with reader_errors_explained(name, _ACCEPTED):
-            return require_plain(name, container.lazy(name, folder))
-
+def _open_arrays(container: Container, folder: Path, columns: Columns | None, needs_flags: bool) -> _Opened:
+    """Fields of a container, whose arrays are read where they are sliced."""
     given = list(container.declared_bytes())
     if columns is not None and columns.episodes is not None:
         raise LogError.at_field("file", "episodes side by side, read whole", _WHOLE)
+
+    def load(name: str) -> NDArray[Any]:
+        with reader_errors_explained(name, ARRAY_ACCEPTED):
+            return require_plain(name, container.load(name))
+
     mapped = match_arrays(columns, given, load)
     check_fields_given(mapped.given, needs_flags)
     if others := list(mapped.other_times(given)):
         raise LogError.at_field("file", f"stamps beside those of time ('{excerpt(others[0])}'), read whole", _WHOLE)
-    sources = dict.fromkeys(source for name in mapped.fields for source in mapped.sources_of(name))
-    arrays = {source: lazy_part(source, given, lazy) for source in sources}
-    fields: dict[str, LazyArray] = {}
-    for name in mapped.fields:
-        with reader_errors_explained(name, _ACCEPTED):
-            fields[name] = MappedArray(mapped, name, arrays)
-    return mapped.text(load), fields
+    sources = {source: sample_axis(source, given) for source in mapped.sources if source != mapped.frame_column}
+    shapes, counts = dict[str, tuple[int, ...]](), dict[str, int]()
+    for source, (name, axis) in sources.items():
+        with reader_errors_explained(source, ARRAY_ACCEPTED):
+            shapes[source] = container.shape(name, folder)
+            if not shapes[source]:
+                require_plain(source, container.load(name))
+                raise LogError.at_field(f"'{source}'", "a single value", "an array with a row for each sample")
+            counts[source] = shapes[source][axis]
+    constant = {source for field in mapped.fields for source in mapped.constant_sources(field)}
+    constant = {source for source in constant if len(shapes[source]) == 1}
+
+    def take(source: str, rows: slice) -> NDArray[Any]:
+        if source in constant or source not in sources:
+            return load_part(source, given, load)
+        axis = sources[source][1]
+        with reader_errors_explained(source, ARRAY_ACCEPTED):
+            return load_part(source, given, lambda name: require_plain(name, container.rows(name, rows, axis)))
+
+    lengths = {field: _common_length(mapped.sources_of(field), counts, constant) for field in mapped.fields}
+    every = slice(0, lengths["time"])
+    counted = mapped.stamps(0, lengths["time"]) if mapped.step is not None else None
+    time = mapped.value("time", partial(take, rows=every)) if counted is None else counted
+    return lengths, time, lambda rows: mapped.read(partial(take, rows=rows))
 
 
-def _open_table(
-    path: Path, folder: Path | None, columns: Columns | None, needs_flags: bool
-) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
-    """Text and arrays of a table, which is read once."""
+def _common_length(sources: Sequence[str], counts: Mapping[str, int], constant: Collection[str]) -> int:
+    """Samples of the arrays of a field; LogError where they differ."""
+    sampled = [source for source in sources if source not in constant]
+    most = max((counts[source] for source in sampled), default=0)
+    for source in sampled:
+        if counts[source] != most:
+            raise LogError.at_field(f"'{source}'", f"{counts[source]} samples", f"{most}, as others have")
+    return most
+
+
+def _open_table(path: Path, folder: Path, columns: Columns | None, needs_flags: bool) -> _Opened:
+    """Fields of a table, which is read once, to files."""
     names: dict[str, NDArray[Any]] = {}
-    if folder is None:
-        raw = read_table(path, columns)
-        check_fields_given(raw, needs_flags)
-        return {n: x for n, x in raw.items() if _is_text(n)}, {n: x for n, x in raw.items() if not _is_text(n)}
     spills: defaultdict[str, Spill] = defaultdict(partial(Spill, path, folder))
     for number, block in enumerate(table_blocks(path, columns)):
         if not number:
             check_fields_given(block, needs_flags)
             continue
         for name, array in block.items():
-            if not _is_text(name):
+            if field_shape(name)[:1] == ("N",):
                 spills[name].append(array)
             elif names.setdefault(name, array).tolist() != array.tolist():
                 found = f"'{names[name]}' and '{array}'"
                 raise LogError.at_field(f"column '{name}'", found, "one name, the same in every row")
     if not spills:
         raise LogError.at_field("time", "no samples", "at least one sample")
-    return names, {name: spill.array() for name, spill in spills.items()}
+    arrays = {name: spill.array() for name, spill in spills.items()}
+    lengths = {name: len(array) for name, array in arrays.items()}
+    return lengths, arrays["time"], lambda rows: names | {name: array[rows] for name, array in arrays.items()}
 
 
-def _is_text(name: str) -> bool:
-    return name in NAME_FIELDS or SHAPES.get(name) == ()
-
-
-def _check_blocks(source: str, names: dict[str, NDArray[Any]], fields: dict[str, LazyArray]) -> LogBlocks:
+def _check_blocks(
+    source: str, lengths: dict[str, int], time: NDArray[Any], read_rows: Callable[[slice], dict[str, NDArray[Any]]]
+) -> LogBlocks:
     """The log, after all checks of names and shapes."""
-    time = fields.pop("time")
-    check_shape("time", _empty(time), SHAPES["time"], {})
-    with reader_errors_explained("time", _ACCEPTED):
-        stamps = to_float64("time", np.asarray(time[:]))
+    check_shape("time", np.broadcast_to(False, time.shape), SHAPES["time"], {})
+    stamps = to_float64("time", np.array(time))
+    first = read_rows(slice(0, 1))
+    names = {name: array for name, array in first.items() if name not in lengths}
     sizes = {"N": len(stamps)}
     for name, letter in NAME_FIELDS.items():
         sizes[letter] = len(parse_names(name, names[name])) if name in names else 0
-    for name, array in fields.items():
-        check_shape(name, _empty(array), field_shape(name), sizes)
-    return LogBlocks(source, names, stamps, fields)
-
-
-def _empty(array: LazyArray) -> NDArray[Any]:
-    """An array of the same shape that takes no memory."""
-    return np.broadcast_to(np.zeros((), dtype=array.dtype if array.dtype.kind in "biuf" else bool), array.shape)
+    shapes = {name: array.shape[1:] for name, array in first.items() if name in lengths and name != "time"}
+    for name, shape in shapes.items():
+        check_shape(name, np.broadcast_to(False, (lengths[name], *shape)), field_shape(name), sizes)
+    return LogBlocks(source, names, stamps, shapes, read_rows)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, current_file, during
 from torchid.logs.alignment import align_by_stamps, read_joined
-from torchid.logs.arrays import load_part, parse_frame, parse_names, require_plain
+from torchid.logs.arrays import ARRAY_ACCEPTED, load_part, parse_frame, parse_names, require_plain
 from torchid.logs.bags import read_bag
 from torchid.logs.columns import Columns
 from torchid.logs.containers import (
@@ -26,7 +26,7 @@ from torchid.logs.containers import (
     reader_errors_explained,
     save_arrays,
 )
-from torchid.logs.episodes import arrays_of_episodes
+from torchid.logs.episodes import EpisodeArrays
 from torchid.logs.force_plates import about_world_origin
 from torchid.logs.gaps import bridge_gaps, refuse_gaps
 from torchid.logs.log import (
@@ -232,15 +232,15 @@ def _read_arrays(
 ) -> dict[str, NDArray[Any]]:
     """The arrays of a .npz or HDF5 file; all names are checked first."""
     with open_container(path) as container:
-        arrays = arrays_of_episodes(container, columns)
 
         def load(name: str) -> NDArray[Any]:
-            with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
+            with reader_errors_explained(name, ARRAY_ACCEPTED):
                 return require_plain(name, arrays.load(name))
 
         def take(name: str) -> NDArray[Any]:
             return load_part(name, names, load)
 
+        arrays = EpisodeArrays(list(container.declared_bytes()), container.load, columns)
         names = arrays.names
         mapped = match_arrays(columns, names, load)
         if check is not None:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchid.errors import format_percent, join_names
-from torchid.logs.lazy_arrays import Spill
+from torchid.logs.spill import Spill
 from torchid.parallel import one_thread
 from torchid.parameters import GRAVITY, MASS, Array
 from torchid.problem.chunks import CHUNK, ProgressCallback, blocks_in, chunks_by_state, map_chunks

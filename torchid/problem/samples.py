@@ -14,9 +14,9 @@ from torch import Tensor
 
 from torchid.errors import LogError, about_file
 from torchid.logs import Log
-from torchid.logs.lazy_arrays import MappedPages
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
+from torchid.logs.spill import MappedPages
 from torchid.parameters import GRAVITY, WRENCH_COMPONENTS, Array
 from torchid.problem import log_joints
 from torchid.problem.log_joints import columns_in_order, joint_order, recorded_torques

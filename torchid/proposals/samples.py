@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import excerpt
-from torchid.logs.arrays import TRANSPOSED, fields_of_records, require_plain
+from torchid.logs.arrays import ARRAY_ACCEPTED, TRANSPOSED, fields_of_records, require_plain
 from torchid.logs.bags import ENCODINGS, MESSAGES_ACCEPTED, list_channels, make_deserializer, messages_of
 from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files, open_container, reader_errors_explained
-from torchid.logs.episodes import flat, groups_of, in_groups
+from torchid.logs.episodes import groups_of, in_groups
 from torchid.logs.tables import sample_table
 from torchid.proposals.names import propose_field
 
@@ -38,7 +38,7 @@ def read_sample(path: Path) -> FileSample:
     out: dict[str, NDArray[Any] | None] = {}
     with open_container(path) as container:
         for name in container.declared_bytes():
-            with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
+            with reader_errors_explained(name, ARRAY_ACCEPTED):
                 array = container.load(name)
             for part, values in fields_of_records(name, array):
                 is_list = values.ndim == 1 and len(values) <= _NAMES
@@ -146,14 +146,13 @@ def find_episodes(sample: FileSample) -> FoundEpisodes | None:
     axis = int(steps[1] > steps[0])
     count, samples = shape[axis], shape[1 - axis]
     lengths = next((x for x, y in sample.items() if _LENGTHS.fullmatch(x) and y is not None and y.size == count), "")
-    shown = None if not lengths else np.ravel(sample[lengths]).astype(int)[:1]  # type: ignore[arg-type]
+    shown = samples if not lengths else int(np.ravel(sample[lengths])[0])  # type: ignore[arg-type]
 
     def first_of(x: NDArray[Any]) -> NDArray[Any]:
         if x.shape[:2] == shape:
-            first = np.take(x, [0], axis=axis)
-            return flat(first, (first.shape[0], first.shape[1]), axis, shown)
+            return np.take(x, 0, axis=axis)[:shown]
         is_clock = x.size == samples != count and x.ndim < 3
-        return x.ravel()[: None if shown is None else shown[0]] if is_clock else x
+        return x.ravel()[:shown] if is_clock else x
 
     taken = {name: x if x is None or x.dtype.kind not in "fiub" else first_of(x) for name, x in sample.items()}
     entry = {"axis": axis} | ({"lengths": lengths} if lengths else {})

@@ -31,7 +31,6 @@ from torchid.logs.blocks import GIGABYTE, LogBlocks, has_blocks, log_bytes, open
 from torchid.logs.dry_friction import with_sign_filter, with_signs_of
 from torchid.logs.flags import with_flags_by_force
 from torchid.logs.gaps import Coverage
-from torchid.logs.lazy_arrays import MappedPages, Spill
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.low_pass import LowPass
 from torchid.logs.preprocess import (
@@ -47,6 +46,7 @@ from torchid.logs.preprocess import (
 from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.segments import count_samples, long_segments, with_delayed_torques
 from torchid.logs.signal_noise import signal_noise, warn_of_noisy_accelerations
+from torchid.logs.spill import MappedPages, Spill
 from torchid.logs.time_range import LogPart, split_range
 from torchid.logs.timeline import JITTER, SPLINE_OVERLAP, Timeline
 from torchid.parameters import Array
@@ -194,7 +194,7 @@ class LogReader:
     def _require_known_heading(self, blocks: LogBlocks) -> None:
         """Refuse a tilted floor on which the feet alone tell a heading, from the beginning of the whole log on."""
         settings = self.setup.config.preprocessing
-        measured = "imu_frame" in blocks.names or any(name.startswith("base_quat") for name in blocks.fields)
+        measured = "imu_frame" in blocks.names or any(name.startswith("base_quat") for name in blocks.row_shapes)
         by_feet = settings.base_motion is not None or (settings.detect_contacts is not None and not measured)
         if by_feet and any(contact.normal != UP for contact in self.setup.contacts):
             setting = "detect_contacts" if settings.base_motion is None else "base_motion: contacts"
