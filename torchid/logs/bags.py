@@ -59,20 +59,31 @@ _TYPES: dict[type[AnyTopic], tuple[str, ...]] = {
     ForceTopic: (*NUMBERS, *NUMBER_ARRAYS, *WRENCHES),
     ContactTopic: FLAGS,
 }
-_POSE, _TWIST = "pose.pose", "twist.twist"
-_PARTS: dict[str, tuple[str, ...]] = {
-    IMUS[0]: ("linear_acceleration", "angular_velocity", "orientation"),
-    ODOMETRIES[0]: (f"{_POSE}.position", f"{_POSE}.orientation", f"{_TWIST}.linear", f"{_TWIST}.angular"),
+_JOINT_FIELDS = {"position": "joint_position", "velocity": "joint_velocity", "effort": "joint_torque"}
+_IMU_PARTS = ("linear_acceleration", "angular_velocity", "orientation")
+_PATHS: dict[str, tuple[str, ...]] = {
+    JOINT_STATES[0]: tuple(_JOINT_FIELDS),
+    IMUS[0]: (*_IMU_PARTS, *(f"{part}_covariance.0" for part in _IMU_PARTS)),
+    ODOMETRIES[0]: ("pose.pose.position", "pose.pose.orientation", "twist.twist.linear", "twist.twist.angular"),
     WRENCHES[0]: ("wrench.force", "wrench.torque"),
     WRENCHES[1]: ("force", "torque"),
+    **dict.fromkeys((*NUMBERS, *NUMBER_ARRAYS, *FLAGS), ("data",)),
+    **dict.fromkeys(
+        MOTORS,
+        (
+            *(f"motor_state.{part}" for part in ("q", "dq", "tau_est")),
+            *(f"imu_state.{part}" for part in ("accelerometer", "gyroscope", "quaternion")),
+            *("foot_force", "mode_pr"),
+        ),
+    ),
 }
-"""Vectors of messages, in the order of their numbers in a row."""
+"""Parts of messages that are read, by their type."""
 
-_JOINT_FIELDS = {"position": "joint_position", "velocity": "joint_velocity", "effort": "joint_torque"}
 _IMU = "logs.topics.imu"
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _PACKAGES = ("rosbags", "mcap", "lz4", "zstandard")
-_FLAG_ROLE, _FEET = "contact_active", "foot_force"
+_FLAG_ROLE = "contact_active"
+_FEET = "foot_force"
 _REPORT_EVERY, _LISTED = 1000, 30  # messages between reports of progress, topics in a message
 
 
@@ -175,35 +186,59 @@ def _typestore(encoding: str) -> Any:
 # ------------------------------------------------------------------------------------------------ messages of one topic
 
 
+def _numbers(message: Any, path: str) -> list[float]:
+    """The numbers in a part of a message, of a list of parts those of all; none where there is no such part."""
+    value = message
+    for name in path.split("."):
+        if isinstance(value, list):
+            value = [getattr(item, name) for item in value]
+        else:
+            value = value[int(name)] if name.isdigit() else getattr(value, name, [])
+    if hasattr(value, "x"):  # a vector or a quaternion
+        return [getattr(value, axis) for axis in "xyzw" if hasattr(value, axis)]
+    return value.tolist() if isinstance(value, np.ndarray) else value if isinstance(value, list) else [value]
+
+
+@dataclass(eq=False)
+class _Rows:
+    """Stamps [ns], or ticks, times of receipt [ns] and numbers of messages."""
+
+    stamps: array[int] = field(default_factory=lambda: array("q"))
+    received: array[int] = field(default_factory=lambda: array("q"))
+    values: array[float] = field(default_factory=lambda: array("d"))
+
+
 @dataclass(eq=False)
 class _Messages:
-    """Messages of a topic as rows of numbers in the order of receipt, those of joints by their names.
+    """Messages of a topic as rows of numbers in the order of receipt.
 
     Attributes:
         topic, type: its name and type.
         frame: `header.frame_id`, of an odometry `child_frame_id`, that all have; None before the first.
-        rows: by names of joints and the parts that messages have of each, or the length of an array, else ().
+        rows: by the names of joints in a message, and how many numbers it has of each part.
     """
 
     topic: str
     type: str
     frame: str | None = None
-    rows: dict[tuple[Any, ...], _Rows] = field(default_factory=dict)
+    rows: dict[tuple[tuple[str, ...], tuple[int, ...]], _Rows] = field(default_factory=dict)
 
-    def add(self, message: Any, received: int, row: Callable[[Any], FloatArray]) -> None:
-        """Add a message with its time of receipt [ns]; `row`: its numbers."""
+    def add(self, message: Any, received: int) -> None:
+        """Add a message with its time of receipt [ns]."""
         self._check_frame(message)
-        parts = tuple(x for x in _JOINT_FIELDS if self.type in JOINT_STATES and len(getattr(message, x)))
-        key: tuple[Any, ...] = (tuple(message.name), parts) if self.type in JOINT_STATES else ()
-        key = (len(message.data),) if self.type in NUMBER_ARRAYS else key
-        if key not in self.rows:
-            for name in key[0] if self.type in JOINT_STATES else ():
-                check_names([len(key[0])])
+        numbers = [_numbers(message, path) for path in _PATHS[self.type]]
+        layout = (tuple(getattr(message, "name", ())), tuple(map(len, numbers)))
+        if layout not in self.rows:
+            check_names([len(layout[0])])
+            for name in layout[0]:
                 require_plain_name(name)
-            self.rows[key] = _Rows()
+            self.rows[layout] = _Rows()
+        rows = self.rows[layout]
         stamp = message.header.stamp if hasattr(message, "header") else None
-        number = getattr(message, "tick", 0) if stamp is None else stamp.sec * 10**9 + stamp.nanosec
-        self.rows[key].add(number, received, row(message))
+        rows.stamps.append(getattr(message, "tick", 0) if stamp is None else stamp.sec * 10**9 + stamp.nanosec)
+        rows.received.append(received)
+        for part in numbers:
+            rows.values.extend(part)
         if 8 * sum(len(rows.values) for rows in self.rows.values()) > MAX_ARRAYS:
             raise LogError.at_field(self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
 
@@ -218,25 +253,32 @@ class _Messages:
             found = f"{name} '{self.frame}', then '{require_plain_name(frame)}'"
             raise LogError.at_field(self.topic, found, f"one {name}")
 
+    def parts(self, layout: tuple[tuple[str, ...], tuple[int, ...]]) -> _Parts:
+        """The messages of one layout."""
+        rows = self.rows[layout]
+        values = np.array(rows.values, dtype=np.float64).reshape(len(rows.stamps), -1)
+        split = np.split(values, np.cumsum(layout[1])[:-1], axis=1)
+        stamps, received = (np.array(x, dtype=np.int64) for x in (rows.stamps, rows.received))
+        return _Parts(stamps, received, dict(zip(_PATHS[self.type], split, strict=True)))
 
-@dataclass(eq=False)
-class _Rows:
-    """Stamps [ns], or ticks, times of receipt [ns] and numbers of messages."""
+    def parts_of_all(self) -> _Parts:
+        """All messages; LogError where there are none, or they have arrays of several lengths."""
+        if not self.rows:
+            raise LogError.at_field(self.topic, "no messages", "at least one")
+        layout, *others = self.rows
+        if others:
+            found = f"arrays of {' and '.join(str(sum(lengths)) for _, lengths in self.rows)} numbers"
+            raise LogError.at_field(self.topic, found, "as many in every message")
+        return self.parts(layout)
 
-    stamps: array[int] = field(default_factory=lambda: array("q"))
-    received: array[int] = field(default_factory=lambda: array("q"))
-    values: array[float] = field(default_factory=lambda: array("d"))
 
-    def add(self, stamp: int, received: int, row: FloatArray) -> None:
-        self.stamps.append(stamp)
-        self.received.append(received)
-        self.values.frombytes(np.asarray(row, dtype=np.float64).tobytes())
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """Stamps (N,) [ns], or ticks, times of receipt (N,) [ns] and numbers (N, k) by part of messages."""
 
-    def arrays(self) -> tuple[Stamps, Stamps, FloatArray]:
-        """The stamps (N,), the times of receipt (N,) and the numbers (N, k)."""
-        count = len(self.stamps)
-        values = np.array(self.values, dtype=np.float64).reshape(count, -1) if count else np.zeros((0, 0))
-        return np.array(self.stamps, dtype=np.int64), np.array(self.received, dtype=np.int64), values
+    stamps: Stamps
+    received: Stamps
+    numbers: dict[str, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,27 +295,6 @@ class _TopicSeries:
     names: tuple[str, ...] = ()
 
 
-def _vectors(message: Any, parts: Sequence[str]) -> FloatArray:
-    """The numbers of the vectors and quaternions (xyzw) of a message."""
-    vectors = [attrgetter(part)(message) for part in parts]
-    return np.array([getattr(x, axis) for x in vectors for axis in ("x", "y", "z", "w") if hasattr(x, axis)])
-
-
-def _row_maker(topic: AnyTopic, kind: str) -> Callable[[Any], FloatArray]:
-    """The function that gives the numbers of a message of a type."""
-    if isinstance(topic, LowStateTopic):
-        return LowState(topic).row
-    if kind in _PARTS:
-        return lambda message: _vectors(message, _PARTS[kind])
-    if kind in JOINT_STATES:
-        return _joint_row
-    return lambda message: np.atleast_1d(np.asarray(message.data, dtype=np.float64))
-
-
-def _joint_row(message: Any) -> FloatArray:
-    return np.concatenate([np.asarray(getattr(message, part), dtype=np.float64) for part in _JOINT_FIELDS])
-
-
 def _series(topic: AnyTopic, messages: _Messages) -> _TopicSeries:
     """What a role has of a topic: its messages in the order of their stamps, without duplicates.
 
@@ -285,91 +306,77 @@ def _series(topic: AnyTopic, messages: _Messages) -> _TopicSeries:
         TorchidWarning: duplicate messages.
     """
     names: tuple[str, ...] = ()
-    parts: tuple[str, ...] = ()
     if isinstance(topic, JointTopic):
-        names, parts, (stamps, received, rows) = _joint_rows(topic, messages)
+        names, parts = _joint_parts(topic, messages)
+        fields = parts.numbers
     else:
-        if len(messages.rows) > 1:
-            found = f"arrays of {' and '.join(str(key[0]) for key in messages.rows)} numbers"
-            raise LogError.at_field(messages.topic, found, "as many in every message")
-        stamps, received, rows = next(iter(messages.rows.values()), _Rows()).arrays()
-    if not len(stamps):
-        raise LogError.at_field(messages.topic, "no messages", "at least one")
-    if isinstance(topic, ImuTopic) and not topic.orientation:
-        rows = rows[:, :6]
+        parts = messages.parts_of_all()
+        fields = _fields(topic, messages, parts.numbers)
+    stamps = parts.stamps
     stamped = bool(stamps.any())
     if isinstance(topic, LowStateTopic):
-        stamps, stamped = LowState(topic).stamps(stamps, received)
+        names = tuple(name for name in topic.order if name is not None)
+        stamps, stamped = _low_state_stamps(topic, parts.stamps, parts.received)
     elif not stamped:
-        stamps = received
-    stamps, rows = _in_order(topic, stamps, rows)
-    if isinstance(topic, JointTopic):
-        fields = dict(zip([_JOINT_FIELDS[part] for part in parts], np.split(rows, len(parts), axis=1), strict=True))
-    else:
-        fields = _fields(topic, messages, rows)
-        names = LowState(topic).names if isinstance(topic, LowStateTopic) else ()
+        stamps = parts.received
+    if np.any(np.diff(stamps) < 0):
+        order = np.argsort(stamps, kind="stable")
+        stamps = stamps[order]
+        fields = {name: x[order] for name, x in fields.items()}
+    again = np.flatnonzero(np.diff(stamps) == 0) + 1
+    if len(again):
+        rows = np.concatenate([x[again] for x in fields.values()], axis=1).view(np.int64)
+        differ = np.any(rows != np.concatenate([x[again - 1] for x in fields.values()], axis=1).view(np.int64), axis=1)
+        if differ.any():
+            found = f"messages of different content with one stamp, {stamps[again[np.argmax(differ)]] / 1e9:.9f} s"
+            by_tick = f", or {_LOW_STATE}.stamps: receipt" * isinstance(topic, LowStateTopic)
+            raise LogError.at_field(str(topic.topic), found, "every stamp once" + by_tick)
+        warn_about_file(f"{topic.topic}: {len(again)} messages come twice; each counts once")
+        stamps = np.delete(stamps, again)
+        fields = {name: np.delete(x, again, axis=0) for name, x in fields.items()}
     return _TopicSeries(messages.topic, stamps, fields, stamped, names)
 
 
-def _in_order(topic: AnyTopic, stamps: Stamps, rows: FloatArray) -> tuple[Stamps, FloatArray]:
-    """Messages in the order of their stamps, each stamp once."""
-    if np.any(np.diff(stamps) < 0):
-        order = np.argsort(stamps, kind="stable")
-        stamps, rows = stamps[order], rows[order]
-    again = np.flatnonzero(np.diff(stamps) == 0) + 1
-    if len(again):
-        differ = np.any(rows[again].view(np.int64) != rows[again - 1].view(np.int64), axis=1)
-        if differ.any():
-            at = stamps[again[np.argmax(differ)]] / 1e9
-            found = f"messages of different content with one stamp, {at:.9f} s"
-            by_tick = ", or logs.topics.low_state.stamps: receipt" * isinstance(topic, LowStateTopic)
-            raise LogError.at_field(str(topic.topic), found, "every stamp once" + by_tick)
-        warn_about_file(f"{topic.topic}: {len(again)} messages come twice; each counts once")
-        stamps, rows = np.delete(stamps, again), np.delete(rows, again, axis=0)
-    return stamps, rows
-
-
-def _joint_rows(
-    topic: JointTopic, messages: _Messages
-) -> tuple[tuple[str, ...], tuple[str, ...], tuple[Stamps, Stamps, FloatArray]]:
-    """Joints, the parts that all messages with these have, and these messages in the order of the joints.
+def _joint_parts(topic: JointTopic, messages: _Messages) -> tuple[tuple[str, ...], _Parts]:
+    """Joints, and of the messages with these the fields that all have, in the order of the joints.
 
     Joints are those that are stated, else those of the first message; messages of other joints are skipped.
     """
     wanted = tuple(topic.joints or ())
-    kept: list[tuple[Stamps, Stamps, FloatArray]] = []
-    common: tuple[str, ...] = ()
-    for (given, parts), rows in messages.rows.items():
+    kept: list[_Parts] = []
+    for layout, rows in messages.rows.items():
+        given, lengths = layout
         names = tuple(topic.names.get(name, name) for name in given)
         wanted = wanted or names
         if topic.joints and not set(names) & set(wanted):
             continue
         _check_joints(topic, names, wanted)
-        common = common or parts
-        if parts != common or "position" not in parts:
-            found = f"a message with {' and '.join(parts) or 'nothing'}"
-            accepted = f"positions, and in every message {' and '.join(common) or 'the same'}"
-            raise LogError.at_field(messages.topic, found, accepted)
-        if len(rows.values) != len(rows.stamps) * len(parts) * len(names):
+        of_layout = [path for path, length in zip(_JOINT_FIELDS, lengths, strict=True) if length]
+        common = list(kept[0].numbers) if kept else [_JOINT_FIELDS[path] for path in of_layout]
+        if [_JOINT_FIELDS[path] for path in of_layout] != common or "position" not in of_layout:
+            in_all = " and ".join(path for path, name in _JOINT_FIELDS.items() if name in common)
+            found = f"a message with {' and '.join(of_layout) or 'nothing'}"
+            raise LogError.at_field(messages.topic, found, f"positions, and in every message {in_all or 'the same'}")
+        if any(length != len(names) for length in lengths if length):
             found = f"{len(rows.values)} values in {len(rows.stamps)} messages of {len(names)} names"
-            raise LogError.at_field(messages.topic, found, f"one {' and one '.join(parts)} per name")
-        stamps, received, values = rows.arrays()
+            raise LogError.at_field(messages.topic, found, f"one {' and one '.join(of_layout)} per name")
+        parts = messages.parts(layout)
         order = [names.index(name) for name in wanted]
-        ordered = values.reshape(len(stamps), len(parts), len(names))[:, :, order]
-        kept.append((stamps, received, ordered.reshape(len(stamps), -1)))
+        fields = {_JOINT_FIELDS[path]: parts.numbers[path][:, order] for path in of_layout}
+        kept.append(_Parts(parts.stamps, parts.received, fields))
     every = tuple(dict.fromkeys(name for given, _ in messages.rows for name in given))
-    if not kept and wanted and every:
+    if not every:
+        raise LogError.at_field(messages.topic, "no messages", "at least one")
+    if not kept:
         raise UnknownNameError.at_field("logs.topics.joint_states.joints", wanted[0], every)
-    for name in topic.names if kept else ():
+    for name in topic.names:
         if name not in every:
             raise UnknownNameError.at_field("logs.topics.joint_states.names", name, every)
-    if not kept:
-        return wanted, common, _Rows().arrays()
-    stamps, received, values = (np.concatenate(arrays) for arrays in zip(*kept, strict=True))
-    if len(kept) > 1:
-        order_of_receipt = np.argsort(received, kind="stable")
-        stamps, received, values = stamps[order_of_receipt], received[order_of_receipt], values[order_of_receipt]
-    return wanted, common, (stamps, received, values)
+    received = np.concatenate([parts.received for parts in kept])
+    by_receipt = np.argsort(received, kind="stable") if len(kept) > 1 else slice(None)
+    fields = {name: np.concatenate([x.numbers[name] for x in kept])[by_receipt] for name in kept[0].numbers}
+    stamps = np.concatenate([parts.stamps for parts in kept])
+    return wanted, _Parts(stamps[by_receipt], received[by_receipt], fields)
 
 
 def _check_joints(topic: JointTopic, names: Sequence[str], wanted: Sequence[str]) -> None:
@@ -384,160 +391,130 @@ def _check_joints(topic: JointTopic, names: Sequence[str], wanted: Sequence[str]
         raise LogError.at_field(topic.topic, found, accepted)
 
 
-def _fields(topic: AnyTopic, messages: _Messages, rows: FloatArray) -> dict[str, FloatArray]:
-    """The fields of a log, or of one contact, in the rows (N, k) of messages."""
+def _fields(topic: AnyTopic, messages: _Messages, parts: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """The fields of a log, or of one contact, in the parts (N, k) of messages."""
     if isinstance(topic, LowStateTopic):
-        return LowState(topic).fields(rows, messages.type)
+        return _low_state_fields(topic, parts)
     if isinstance(topic, ImuTopic):
-        out = {"imu_specific_force": rows[:, :3], "imu_angular_velocity": rows[:, 3:6]}
-        if topic.orientation:
-            if len(rows) > 1 and not np.any(rows[:, 6:] != rows[0, 6:]):
-                found = f"one orientation throughout, {np.round(rows[0, 6:], 3).tolist()}, as of a driver without any"
-                raise LogError.at_field(messages.topic, found, f"orientations, or {_IMU}.orientation: false")
-            out["base_quat_xyzw"] = require_unit(messages.topic, rows[:, 6:], _IMU)
-        return out
+        return _imu_fields(topic, parts)
     if isinstance(topic, OdometryTopic):
-        out = {"base_position_world": rows[:, :3], "base_quat_xyzw": rows[:, 3:7]}
+        position, quat, linear, angular = parts.values()
         frame = {"child": "base", "world": "world"}.get(topic.twist)
-        if frame is not None:
-            out[f"base_linear_velocity_{frame}"] = rows[:, 7:10]
-            out[f"base_angular_velocity_{frame}"] = rows[:, 10:]
-        return out
-    if not isinstance(topic, (WrenchTopic, ForceTopic)):
-        return {"active": rows}
-    signed = rows if topic.sign == 1 else -rows
+        twist = {f"base_linear_velocity_{frame}": linear, f"base_angular_velocity_{frame}": angular}
+        return {"base_position_world": position, "base_quat_xyzw": quat} | (twist if frame is not None else {})
+    rows = np.concatenate(list(parts.values()), axis=1)
     if isinstance(topic, WrenchTopic):
-        return {"wrench": signed}
+        return {"wrench": topic.sign * rows}
+    if not isinstance(topic, ForceTopic):
+        return {"active": rows}
     column = ("fx", "fy", "fz").index(topic.component or "fz") if messages.type in WRENCHES else topic.index or 0
     if column >= rows.shape[1]:
         found = f"an array of {rows.shape[1]} numbers, without index {column}"
         raise LogError.at_field(messages.topic, found, "an index below that, from 0 on")
-    return {"force": signed[:, column : column + 1]}
+    return {"force": topic.sign * rows[:, column : column + 1]}
 
 
-def _check_message(topic: AnyTopic, name: str, message: Any) -> None:
-    """Refuse a message of an IMU whose driver says that it does not have a reading."""
-    if not isinstance(topic, ImuTopic):
-        return
-    for part in ("linear_acceleration", "angular_velocity", *["orientation"] * topic.orientation):
-        if getattr(message, f"{part}_covariance")[0] == -1.0:
+def _imu_fields(topic: ImuTopic, parts: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Readings of an IMU; LogError where its driver says that it does not have one."""
+    fields = ("imu_specific_force", "imu_angular_velocity", *["base_quat_xyzw"] * topic.orientation)
+    out = dict(zip(fields, (parts[part] for part in _IMU_PARTS), strict=False))
+    for part in _IMU_PARTS[: len(fields)]:
+        if (parts[f"{part}_covariance.0"] == -1.0).any():
             accepted = "an IMU with both" if part != "orientation" else f"{_IMU}.orientation: false"
-            raise LogError.at_field(name, f"no {part} (the first of its covariances is -1)", accepted)
+            raise LogError.at_field(topic.topic, f"no {part} (the first of its covariances is -1)", accepted)
+    if topic.orientation:
+        quat = out["base_quat_xyzw"]
+        if len(quat) > 1 and not np.any(quat != quat[0]):
+            found = f"one orientation throughout, {np.round(quat[0], 3).tolist()}, as of a driver without any"
+            raise LogError.at_field(topic.topic, found, f"orientations, or {_IMU}.orientation: false")
+        out["base_quat_xyzw"] = require_unit(topic.topic, quat, _IMU)
+    return out
 
 
-# ----------------------------------------------------------------------------------------------------- fields of a log
-
-
-# ---------------------------------------------------------------------------------------------- messages of Unitree
+# ------------------------------------------------------------------------------------------------- messages of Unitree
 
 _LOW_STATE = "logs.topics.low_state"
 #: Ticks may be off the times of receipt by this [ns], and by this share of the log: a network stalls, a clock drifts.
 _MAX_TICK_ERROR_NS = 100_000_000
 _MAX_TICK_ERROR_SHARE = 0.01
-_MILLISECOND, _WRAP = 1_000_000, 1 << 32
+_MILLISECOND = 1_000_000
+_WRAP = 1 << 32
 
 
-class LowState:
-    """`unitree_go/LowState` or `unitree_hg/LowState`; the accelerometer reads a specific force, +g upwards at rest."""
+def _check_low_state(topic: LowStateTopic, field: str, kind: str) -> None:
+    """Refuse settings, of a field, that messages of a type do not fit.
 
-    types: tuple[str, ...] = tuple(MOTORS)
+    Raises:
+        LogError: the robot has another type, there are fewer motors than joints, or no foot sensors.
+    """
+    robot = JOINT_ORDERS.get(topic.robot or "")
+    if robot is not None and robot.message != kind:
+        others = ", ".join(x for x, order in JOINT_ORDERS.items() if order.message == kind)
+        found = f"'{topic.robot}', which sends {robot.message}, though {topic.topic} carries {kind}"
+        raise LogError.at_field(f"{field}.robot", found, others)
+    if len(topic.order) > MOTORS[kind]:
+        found = f"{len(topic.order)} names, though {kind} has {MOTORS[kind]} motors"
+        raise LogError.at_field(f"{field}.joints", found, "at most that many, by number of the motor")
+    if topic.reads_feet and kind != GO:
+        key = "forces" if topic.forces else "above"
+        raise LogError.at_field(f"{field}.{key}", f"set, though {kind} has no foot sensors", f"no {key}")
 
-    def __init__(self, topic: LowStateTopic) -> None:
-        """For the messages of a topic, with the motors of a robot or as they are listed."""
-        self._topic, self._settings = topic.topic, topic
-        self._order = list(topic.order)
-        self.names = tuple(name for name in self._order if name is not None)
 
-    def check_options(self, field: str, kind: str) -> None:
-        """Refuse settings, of a field, that messages of a type do not fit.
+def _low_state_fields(topic: LowStateTopic, parts: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Fields (N, n) of the joints, (N, 3) and (N, 4) of the IMU, and the raw readings of feet (N, 4), if any.
 
-        Raises:
-            LogError: the robot has another type, there are fewer motors than joints, or no foot sensors.
-        """
-        robot, name = JOINT_ORDERS.get(self._settings.robot or ""), self._settings.robot
-        if robot is not None and robot.message != kind:
-            others = ", ".join(x for x, order in JOINT_ORDERS.items() if order.message == kind)
-            found = f"'{name}', which sends {robot.message}, though {self._topic} carries {kind}"
-            raise LogError.at_field(f"{field}.robot", found, others)
-        if len(self._order) > MOTORS[kind]:
-            found = f"{len(self._order)} names, though {kind} has {MOTORS[kind]} motors"
-            raise LogError.at_field(f"{field}.joints", found, "at most that many, by number of the motor")
-        if self._settings.reads_feet and kind != GO:
-            key = "forces" if self._settings.forces else "above"
-            raise LogError.at_field(f"{field}.{key}", f"set, though {kind} has no foot sensors", f"no {key}")
+    The accelerometer reads a specific force, +g upwards at rest. A quaternion that is always the same, as of a driver
+    that does not set it, is none; it is given as others are (xyzw), so that an odometry takes its place.
 
-    def row(self, message: Any) -> FloatArray:
-        """Position, velocity and torque of every motor, specific force, angular velocity, quaternion, foot sensors.
+    Raises:
+        LogError: ankles and waist by motor rather than by joint, or quaternions of no length.
+    """
+    if (modes := parts["mode_pr"]).any():
+        found = f"mode_pr {modes[modes != 0.0][0]:g}: ankles and waist by their parallel motors (A, B), not by joint"
+        raise LogError.at_field(topic.topic, found, "messages with mode_pr 0: pitch and roll")
+    numbers = [number for number, name in enumerate(topic.order) if name is not None]
+    names = {"q": "joint_position", "dq": "joint_velocity", "tau_est": "joint_torque"}
+    out = {name: parts[f"motor_state.{part}"][:, numbers] for part, name in names.items()}
+    if topic.frame is not None:
+        out["imu_specific_force"] = parts["imu_state.accelerometer"]
+        out["imu_angular_velocity"] = parts["imu_state.gyroscope"]
+        wxyz = parts["imu_state.quaternion"]
+        if topic.orientation and np.any(wxyz != wxyz[0]):
+            out["base_quat_xyzw"] = np.roll(require_unit(topic.topic, wxyz, _LOW_STATE), -1, axis=1)
+    feet = parts["foot_force"]
+    return out | ({_FEET: feet} if feet.shape[1] else {})
 
-        Raises:
-            LogError: ankles and waist by motor rather than by joint.
-        """
-        if getattr(message, "mode_pr", 0):
-            found = f"mode_pr {message.mode_pr}: ankles and waist by their parallel motors (A, B), not by joint"
-            raise LogError.at_field(self._topic, found, "messages with mode_pr 0: pitch and roll")
-        motors, imu = message.motor_state, message.imu_state
-        values = [*(x.q for x in motors), *(x.dq for x in motors), *(x.tau_est for x in motors)]
-        arrays = imu.accelerometer, imu.gyroscope, imu.quaternion, getattr(message, "foot_force", np.array([]))
-        return np.array([*values, *(x for array in arrays for x in array.tolist())], dtype=np.float64)
 
-    def fields(self, rows: FloatArray, kind: str) -> dict[str, FloatArray]:
-        """Fields (N, n) of the joints, (N, 3) and (N, 4) of the IMU, and the raw readings of feet (N, 4), if any.
+def _low_state_stamps(topic: LowStateTopic, ticks: Stamps, received: Stamps) -> tuple[Stamps, bool]:
+    """Stamps (N,) [ns] of messages, on the clock of the recording computer, and whether they are the robot's.
 
-        Raises:
-            LogError: quaternions of no length.
-        """
-        count = MOTORS[kind]
-        motors = rows[:, : 3 * count].reshape(len(rows), 3, count)
-        joints = motors[:, :, [number for number, name in enumerate(self._order) if name is not None]]
-        out = dict(zip(("joint_position", "joint_velocity", "joint_torque"), joints.transpose(1, 0, 2), strict=True))
-        if self._settings.frame is not None:
-            out["imu_specific_force"] = rows[:, 3 * count : 3 * count + 3]
-            out["imu_angular_velocity"] = rows[:, 3 * count + 3 : 3 * count + 6]
-            out |= self._orientation(rows[:, 3 * count + 6 : 3 * count + 10])
-        if rows.shape[1] > 3 * count + 10:
-            out["foot_force"] = rows[:, 3 * count + 10 :]
-        return out
+    The robot counts milliseconds since it was switched on, on a clock of its own, from 2^32 on again from 0. What
+    that clock is off by is the median difference to the times of receipt.
 
-    def _orientation(self, wxyz: FloatArray) -> dict[str, FloatArray]:
-        """The base's orientation; nothing where quaternions are always the same, as of a driver that does not set them.
+    Args:
+        topic: its settings.
+        ticks: (N,) [ms] of the messages.
+        received: (N,) [ns], times of receipt.
 
-        They are in the order in which others' come (xyzw), so that an odometry takes their place.
-        """
-        if not self._settings.orientation or not np.any(wxyz != wxyz[0]):
-            return {}
-        return {"base_quat_xyzw": np.roll(require_unit(self._topic, wxyz, _LOW_STATE), -1, axis=1)}
-
-    # ------------------------------------------------------------------------------------------------------- stamps
-
-    def stamps(self, ticks: NDArray[np.int64], received: NDArray[np.int64]) -> tuple[NDArray[np.int64], bool]:
-        """Stamps (N,) [ns] of messages, on the clock of the recording computer, and whether they are the robot's.
-
-        The robot counts milliseconds since it was switched on, on a clock of its own, from 2^32 on again from 0. What
-        that clock is off by is the median difference to the times of receipt.
-
-        Args:
-            ticks: (N,) [ms] of the messages.
-            received: (N,) [ns], times of receipt.
-
-        Raises:
-            LogError: ticks that are no milliseconds, where `stamps` does not say that they are meant.
-        """
-        wanted, constant = self._settings.stamps, not np.any(np.diff(ticks))
-        if wanted == "receipt" or (wanted is None and constant and (len(ticks) > 1 or not ticks.any())):
-            return received, False
-        steps = (np.diff(ticks) + _WRAP // 2) % _WRAP - _WRAP // 2
-        elapsed = np.concatenate([[0], np.cumsum(steps)]) * _MILLISECOND
-        late = received - received[0] - elapsed
-        usual = int(np.clip(np.median(late), -(1 << 62), 1 << 62))  # also for receipts that no clock would give
-        off = np.abs(late - usual)
-        if wanted is None and off.max() > _MAX_TICK_ERROR_NS + _MAX_TICK_ERROR_SHARE * np.ptp(received):
-            found = (
-                f"ticks that advance by {np.ptp(elapsed) / 1e9:.4g} s while messages come for "
-                f"{np.ptp(received) / 1e9:.4g} s, and are off by up to {off.max() / 1e9:.3g} s"
-            )
-            accepted = f"ticks of 1 ms, or {_LOW_STATE}.stamps: receipt, or tick where these are right"
-            raise LogError.at_field(self._topic, found, accepted)
-        return np.asarray(received[:1] + usual + elapsed, dtype=np.int64), True
+    Raises:
+        LogError: ticks that are no milliseconds, where `stamps` does not say that they are meant.
+    """
+    constant = not np.any(np.diff(ticks))
+    if topic.stamps == "receipt" or (topic.stamps is None and constant and (len(ticks) > 1 or not ticks.any())):
+        return received, False
+    steps = (np.diff(ticks) + _WRAP // 2) % _WRAP - _WRAP // 2
+    elapsed = np.concatenate([[0], np.cumsum(steps)]) * _MILLISECOND
+    late = received - received[0] - elapsed
+    usual = int(np.clip(np.median(late), -(1 << 62), 1 << 62))  # also for receipts that no clock would give
+    off = np.abs(late - usual)
+    if topic.stamps is None and off.max() > _MAX_TICK_ERROR_NS + _MAX_TICK_ERROR_SHARE * np.ptp(received):
+        found = (
+            f"ticks that advance by {np.ptp(elapsed) / 1e9:.4g} s while messages come for "
+            f"{np.ptp(received) / 1e9:.4g} s, and are off by up to {off.max() / 1e9:.3g} s"
+        )
+        accepted = f"ticks of 1 ms, or {_LOW_STATE}.stamps: receipt, or tick where these are right"
+        raise LogError.at_field(topic.topic, found, accepted)
+    return np.asarray(received[:1] + usual + elapsed, dtype=np.int64), True
 
 
 class _Recording:
@@ -549,7 +526,9 @@ class _Recording:
 
     def __init__(self, topics: Topics, series: Mapping[str, _TopicSeries], messages: Mapping[str, _Messages]) -> None:
         """Choose the stamps; LogError where there are none."""
-        self.topics, self.series, self._messages = topics, series, messages
+        self.topics = topics
+        self.series = series
+        self._messages = messages
         sampled = [x for role, x in series.items() if not role.startswith(_FLAG_ROLE)]
         late = max(series.values(), key=lambda x: int(x.stamps[0]))
         early = min(sampled, key=lambda x: int(x.stamps[-1]))
@@ -625,7 +604,8 @@ class _Recording:
 
     def contacts(self) -> dict[str, NDArray[Any]]:
         """Contacts in the order of `Topics.contacts`; NaN for the wrench, or force, of one without a topic."""
-        names, topics = self.topics.contacts, self.topics
+        names = self.topics.contacts
+        topics = self.topics
         if not names:
             return {}
         active = np.stack([self._active(name) for name in names], axis=1)
@@ -647,7 +627,8 @@ class _Recording:
     def _active(self, name: str) -> NDArray[np.bool_]:
         """Whether a contact is active, (N,), by its last flag or its last force."""
         topics = self.topics
-        flag, low_state = f"{_FLAG_ROLE}.{name}", topics.low_state
+        flag = f"{_FLAG_ROLE}.{name}"
+        low_state = topics.low_state
         always = np.ones(len(self.time), dtype=np.bool_)
         if name in topics.contact_active:
             has_topic = flag in self.series
@@ -739,10 +720,10 @@ def _check_type(field: str, topic: AnyTopic, channels: Mapping[str, BagChannel])
         raise UnknownNameError.at_field(field, name, channels)
     kind = channels[name].type
     if kind not in _TYPES[type(topic)]:
-        instead = ", or logs.topics.low_state" * (kind in LowState.types)
+        instead = ", or logs.topics.low_state" * (kind in MOTORS)
         raise LogError.at_field(field, f"{name} carries {kind}", " or ".join(_TYPES[type(topic)]) + instead)
     if isinstance(topic, LowStateTopic):
-        LowState(topic).check_options(field, kind)
+        _check_low_state(topic, field, kind)
     if not isinstance(topic, ForceTopic):
         return
     if kind in NUMBER_ARRAYS and topic.index is None:
@@ -762,18 +743,13 @@ def _read(
     progress: Callable[[float], None] | None,
 ) -> dict[str, _Messages]:
     """Every message of the topics in use."""
-    users: dict[str, list[AnyTopic]] = {}
-    for topic in topics:
-        users.setdefault(str(topic.topic), []).append(topic)
+    users = dict.fromkeys(str(topic.topic) for topic in topics)
     out = {name: _Messages(name, channels[name].type) for name in users}
-    makers = {name: _row_maker(used[0], channels[name].type) for name, used in users.items()}
     decoders = {name: make_deserializer(name, channels[name]) for name in users}
     for number, (name, received, data, share) in enumerate(messages_of(files, users)):
         with reader_errors_explained("file", MESSAGES_ACCEPTED):
             message = decoders[name](data)
-            for topic in users[name]:
-                _check_message(topic, name, message)
-            out[name].add(message, received, makers[name])
+            out[name].add(message, received)
         if progress is not None and number % _REPORT_EVERY == 0:
             progress(share)
     return out
