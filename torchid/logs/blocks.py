@@ -18,7 +18,6 @@ from torchid.errors import LogError, about_file, excerpt
 from torchid.logs.arrays import ARRAY_ACCEPTED, load_part, parse_names, require_plain, sample_axis
 from torchid.logs.columns import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
-from torchid.logs.force_plates import about_world_origin
 from torchid.logs.gaps import bridge_gaps
 from torchid.logs.log import (
     NAME_FIELDS,
@@ -30,11 +29,11 @@ from torchid.logs.log import (
     field_shape,
     to_float64,
 )
-from torchid.logs.read import build_log, check_fields_given
+from torchid.logs.read import about_world_origin, build_log, check_fields_given
 from torchid.logs.schema import match_arrays
 from torchid.logs.spill import Spill
 from torchid.logs.table_files import is_text_table
-from torchid.logs.tables import table_blocks, table_size
+from torchid.logs.tables import common_texts, table_blocks, table_size
 from torchid.logs.time_range import split_range
 
 GIGABYTE = 1e9
@@ -159,7 +158,8 @@ def _open_arrays(container: Container, folder: Path, columns: Columns | None, ne
     if others := list(mapped.other_times(given)):
         raise LogError.at_field("file", f"stamps beside those of time ('{excerpt(others[0])}'), read whole", _WHOLE)
     sources = {source: sample_axis(source, given) for source in mapped.sources if source != mapped.frame_column}
-    shapes, counts = dict[str, tuple[int, ...]](), dict[str, int]()
+    shapes = dict[str, tuple[int, ...]]()
+    counts = dict[str, int]()
     for source, (name, axis) in sources.items():
         with reader_errors_explained(source, ARRAY_ACCEPTED):
             shapes[source] = container.shape(name, folder)
@@ -196,20 +196,18 @@ def _common_length(sources: Sequence[str], counts: Mapping[str, int], constant: 
 
 def _open_table(path: Path, folder: Path, columns: Columns | None, needs_flags: bool) -> _Opened:
     """Fields of a table, which is read once, to files."""
-    names: dict[str, NDArray[Any]] = {}
     spills: defaultdict[str, Spill] = defaultdict(partial(Spill, path, folder))
+    texts = list[dict[str, NDArray[Any]]]()
     for number, block in enumerate(table_blocks(path, columns)):
         if not number:
             check_fields_given(block, needs_flags)
             continue
-        for name, array in block.items():
-            if field_shape(name)[:1] == ("N",):
-                spills[name].append(array)
-            elif names.setdefault(name, array).tolist() != array.tolist():
-                found = f"'{names[name]}' and '{array}'"
-                raise LogError.at_field(f"column '{name}'", found, "one name, the same in every row")
+        texts.append({name: array for name, array in block.items() if field_shape(name)[:1] != ("N",)})
+        for name in block.keys() - texts[-1].keys():
+            spills[name].append(block[name])
     if not spills:
         raise LogError.at_field("time", "no samples", "at least one sample")
+    names = common_texts(texts)
     arrays = {name: spill.array() for name, spill in spills.items()}
     lengths = {name: len(array) for name, array in arrays.items()}
     return lengths, arrays["time"], lambda rows: names | {name: array[rows] for name, array in arrays.items()}

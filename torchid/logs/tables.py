@@ -72,35 +72,43 @@ def read_table(path: Path, columns: Columns | None = None) -> Arrays:
     Raises:
         LogError: one line with the file and the column.
     """
-    with _opened(path) as table:
-        if columns is not None and columns.rows_of is not None:
-            columns_of_joints = pivoted(_whole(table), row_names_in_map(columns, table.call("header")[0]))
-            check_column_names(list(columns_of_joints))
-            fields = match_table(columns, list(columns_of_joints))
-            blocks = [{name: columns_of_joints[name] for name in fields.sources}]
-        else:
-            fields = match_table(columns, *table.call("header"))
-            blocks = list(table.stream("read_rows", fields.sources, _texts(fields), True))
-        (out,) = _without_repeats([_fields(fields, _joined(fields.sources, blocks))])
-        return out
+    blocks = list(_without_repeats(_every_block(path, columns, whole=True)))
+    sampled = [name for name in blocks[0] if field_shape(name)[:1] == ("N",)]
+    blocks = blocks[1:] or blocks
+    return common_texts(blocks) | _joined(sampled, blocks)
 
 
 def table_blocks(path: Path, columns: Columns | None = None) -> Iterator[Arrays]:
     """As `read_table`, some rows at a time, after a block without rows."""
-    return _without_repeats(_every_block(path, columns))
+    return _without_repeats(_every_block(path, columns, whole=False))
 
 
-def _every_block(path: Path, columns: Columns | None) -> Iterator[Arrays]:
-    if columns is not None and columns.rows_of is not None:
-        whole = read_table(path, columns)
-        yield {name: x[:0] if field_shape(name)[:1] == ("N",) else x for name, x in whole.items()}
-        yield whole
-        return
+def common_texts(blocks: Iterable[Arrays]) -> Arrays:
+    """Names and other texts of all rows; LogError where they differ."""
+    out: Arrays = {}
+    for block in blocks:
+        for name, array in block.items():
+            if field_shape(name)[:1] != ("N",) and array.tolist() != out.setdefault(name, array).tolist():
+                found = f"'{out[name]}' and '{array}'"
+                raise LogError.at_field(f"column '{name}'", found, "one name, the same in every row")
+    return out
+
+
+def _every_block(path: Path, columns: Columns | None, whole: bool) -> Iterator[Arrays]:
     with _opened(path) as table:
-        fields = match_table(columns, *table.call("header"))
+        if columns is not None and columns.rows_of is not None:
+            every = [name for name, values in table.call("sample").items() if values is not None]
+            of_rows = _joined(every, list(table.stream("read_rows", every, every, True)))
+            wide = pivoted(of_rows, row_names_in_map(columns, table.call("header")[0]))
+            check_column_names(list(wide))
+            fields = match_table(columns, list(wide))
+            blocks: Iterable[Arrays] = [{name: wide[name] for name in fields.sources}]
+        else:
+            fields = match_table(columns, *table.call("header"))
+            blocks = table.stream("read_rows", fields.sources, _texts(fields), whole)
         yield _fields(fields, {name: np.zeros(0) for name in fields.sources})
         rows = 0
-        for block in table.stream("read_rows", fields.sources, _texts(fields), False):
+        for block in blocks:
             out = _fields(fields, block)
             if fields.step is not None:
                 out["time"] = fields.stamps(rows, len(out["time"]))
@@ -113,12 +121,6 @@ def _texts(fields: FileFields) -> list[str]:
     has_threshold = fields.columns.contact_active is not None and fields.columns.contact_active.above is not None
     flags = fields.sources_of("contact_active") if "contact_active" in fields.fields and not has_threshold else ()
     return [*flags, *([fields.frame_column] if fields.frame_column else [])]
-
-
-def _whole(table: RemoteObject) -> dict[str, NDArray[Any]]:
-    """All columns of numbers or texts, and all rows."""
-    names = [name for name, values in table.call("sample").items() if values is not None]
-    return _joined(names, list(table.stream("read_rows", names, names, True)))
 
 
 def _joined(names: Iterable[str], blocks: list[Arrays]) -> Arrays:
@@ -147,7 +149,8 @@ def _fields(fields: FileFields, columns: Arrays) -> Arrays:
 
 def _without_repeats(blocks: Iterable[Arrays]) -> Iterator[Arrays]:
     """Fields of successive rows without those that repeat the one before, stamp and all, whose number is warned of."""
-    count, last = 0, dict[str, NDArray[Any]]()
+    count = 0
+    last = dict[str, NDArray[Any]]()
     for block in blocks:
         fields = {name: x for name, x in block.items() if field_shape(name)[:1] == ("N",)}
         stamps = fields.get("time", np.zeros(0))
@@ -178,7 +181,8 @@ class RowNames:
 
 def row_names_in_map(columns: Columns, texts: Sequence[str]) -> RowNames:
     """What a map says of rows. Raises LogError: a table has no such column, or no stamps."""
-    name, entry = columns.rows_of or "", columns.time
+    name = columns.rows_of or ""
+    entry = columns.time
     if name not in texts:
         raise LogError.at_field(_ROWS_OF, f"no column '{excerpt(name)}'", f"one of {join_names(texts)}")
     named = ["time"] if entry is None else [entry.column, *(getattr(entry, fraction) for fraction in FRACTIONS)]
@@ -210,7 +214,8 @@ def pivoted(columns: Mapping[str, NDArray[Any]], rows: RowNames) -> Arrays:
         raise LogError.at_field(_ROWS_OF, "an empty cell", "a name in each row")
     _, first, codes = np.unique(texts, return_index=True, return_inverse=True)
     order = np.argsort(first)
-    words, codes = [texts[k].strip() for k in np.sort(first)], np.argsort(order)[codes]
+    words = [texts[k].strip() for k in np.sort(first)]
+    codes = np.argsort(order)[codes]
     shared = np.stack([columns[name] for name in rows.stamps], axis=1)
     keys, first, samples = np.unique(shared, axis=0, return_index=True, return_inverse=True)
     samples = samples.reshape(-1)
