@@ -5,7 +5,7 @@ A module for each command: `analyze`, `check` (and `convert`), `compress`, `demo
 
 - a fit: `chosen_settings`, `training`, `plausibility`
 - what `identify` returns and says: `results`, `answer`, and `run_folder`, which makes its page anew too
-- parts of `init` and `analyze`: `init_logs`, `init_robot`, `sensor_set_accuracy`
+- parts of `init` and `analyze`: `init_parts`, `sensor_set_accuracy`
 - folders: `folder`
 """
 

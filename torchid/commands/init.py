@@ -14,15 +14,20 @@ import yaml
 
 from torchid.commands.chosen_settings import needs_these_torques
 from torchid.commands.folder import check_free_file
-from torchid.commands.init_logs import Split, keys_for_gaps, keys_for_length, log_in_folder, named_apart, split_logs
-from torchid.commands.init_robot import (
+from torchid.commands.init_parts import (
     GuessedContact,
+    Split,
     guess_contacts,
     held_joints,
+    keys_for_gaps,
+    keys_for_length,
     limb_sensors,
+    log_in_folder,
     measured_torques,
+    named_apart,
     proposed_sensors,
     read_sensors,
+    split_logs,
     stated_contacts,
     welded_at,
     without_rolling,
@@ -149,7 +154,8 @@ def init(urdf: str | Path, log: str | Path, output: str | Path, total_mass: floa
     if logs and "base_motion" in _from_feet(robot, contacts, fields):
         here = Path("experiment.yaml")
         if not _explains(write(here, contacts, sensors=sensors)) and _explains(write(here, [], sensors=sensors)):
-            contacts, text = [], write(target, [], sensors=sensors)
+            contacts = []
+            text = write(target, [], sensors=sensors)
             out.assumed.append(_HELD)
     _describe(out, robot, contacts, fields, proposal)
     _describe_log(out, read, fields)
@@ -178,7 +184,8 @@ _HELD = (
 
 def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContact], set[str], MapProposal]:
     """Contacts, fields and a map of a table or arrays, or of several that are one log."""
-    samples, size = [], 0.0
+    samples = []
+    size = 0.0
     is_table = existing_log_kind(files[0]) is LogKind.TABLE
     for file in files:
         size = memory_needed(file, PreprocessingConfig().memory_gb, size)
@@ -357,13 +364,13 @@ def _text(
 ) -> str:
     """The experiment file, with comments."""
     from_feet = _from_feet(robot, contacts, fields)
-    own: dict[str, object] = {"mjcf" if is_mjcf(Path(urdf)) else "urdf": _relative(Path(urdf), output)}
-    own |= {"fixed_base": True} if robot.fixed_base or _is_fixed(contacts, fields) else {}
-    own |= {"weld": weld} if (weld := welded_at(robot, held_joints(robot, proposal.lacking))) else {}
+    sections: dict[str, object] = {"mjcf" if is_mjcf(Path(urdf)) else "urdf": _relative(Path(urdf), output)}
+    sections |= {"fixed_base": True} if robot.fixed_base or _is_fixed(contacts, fields) else {}
+    sections |= {"weld": weld} if (weld := welded_at(robot, held_joints(robot, proposal.lacking))) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
     to_fill_in = f", fill in {FILL_IN}" * (FILL_IN in str(proposal.columns))
     lines = [f"# {names}, by torchid init; check what is assumed{to_fill_in}"]
-    lines += yaml_lines("robot", own)
+    lines += yaml_lines("robot", sections)
     lines += [f"  # assumed: weld: {_WELDED}"] * bool(weld)
     if contacts:
         lines.append("contacts:  # assumed: from names of links")

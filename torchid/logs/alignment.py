@@ -114,7 +114,8 @@ class Series:
         return slice(start, int(long[after]) + 1 if after < len(long) else len(self.stamps))
 
     def _interpolated(self, time: FloatArray, run: slice, name: str) -> FloatArray:
-        values, stamps = self.fields[name][run], self.stamps[run]
+        values = self.fields[name][run]
+        stamps = self.stamps[run]
         if is_quaternion(name):
             quat = make_sign_continuous(normalize_quaternions(self._field(name), values))
             quat = spline_derivatives(stamps, quat, time, (0,))[0]
@@ -153,9 +154,9 @@ def read_joined(
     """
     maps = _maps([file.path for file in files], columns)
     parts = []
-    for file, own in zip(files, maps, strict=True):
+    for file, file_columns in zip(files, maps, strict=True):
         with about_file(os.fspath(file.path)):
-            parts.append(_stamped(read(file.path, own), file.shift_s))
+            parts.append(_stamped(read(file.path, file_columns), file.shift_s))
     return _joined([file.path.name for file in files], parts, [os.fspath(file.path) for file in files])
 
 
@@ -192,11 +193,11 @@ def own_stamps(values: NDArray[Any] | None, name: str, stamps: Mapping[str, NDAr
         name: of the array.
         stamps: (K,) each.
     """
-    as_many = [] if values is None else [one for one, time in stamps.items() if len(time) == len(values)]
+    as_many = [] if values is None else [key for key, time in stamps.items() if len(time) == len(values)]
     words = re.findall("[a-z]+", name.lower())
 
-    def alike(one: str) -> int:
-        return len(os.path.commonprefix([re.findall("[a-z]+", one.lower()), words]))
+    def alike(key: str) -> int:
+        return len(os.path.commonprefix([re.findall("[a-z]+", key.lower()), words]))
 
     return max(as_many or [next(iter(stamps))], key=alike)
 
@@ -209,18 +210,18 @@ def _joined(labels: Sequence[str], parts: Sequence[Fields], files: Sequence[str]
     """
     time = _common_stamps(labels, [part["time"] for part in parts])
     names: dict[str, list[str]] = {}
-    for of in NAME_FIELDS:
-        every = [name for part in parts if of in part for name in part[of].tolist()]
-        names |= {of: list(dict.fromkeys(every))} if every else {}
+    for kind_field in NAME_FIELDS:
+        every = [name for part in parts if kind_field in part for name in part[kind_field].tolist()]
+        names |= {kind_field: list(dict.fromkeys(every))} if every else {}
     pieces = dict[str, list[tuple[str, list[str], NDArray[Any]]]]()
     for number, part in enumerate(parts):
         with about_file(files[number]) if files else nullcontext():
             fields = {name: x for name, x in part.items() if name not in NAME_FIELDS}
             for name, values in _aligned(fields, time, parts[0]["time"][0]).items():
-                own = part[names_field(name)].tolist() if names_field(name) in part else []
-                pieces.setdefault(name, []).append((labels[number], own, values))
-    out = {name: _side_by_side(name, of, names.get(names_field(name), []), files) for name, of in pieces.items()}
-    return out | {name: np.array(of, dtype=np.str_) for name, of in names.items()} | {"time": time}
+                own_names = part[names_field(name)].tolist() if names_field(name) in part else []
+                pieces.setdefault(name, []).append((labels[number], own_names, values))
+    out = {name: _side_by_side(name, x, names.get(names_field(name), []), files) for name, x in pieces.items()}
+    return out | {name: np.array(x, dtype=np.str_) for name, x in names.items()} | {"time": time}
 
 
 def _side_by_side(
@@ -232,24 +233,23 @@ def _side_by_side(
         LogError: a field in two files that have the same joints, contacts or sensors of it, or none; or one of these
             that is in no file.
     """
-    own = [name for _, of_file, _ in pieces for name in of_file]
-    if len(pieces) > 1 and (len(set(own)) < len(own) or not all(of_file for _, of_file, _ in pieces)):
+    own_names = [name for _, of_file, _ in pieces for name in of_file]
+    if len(pieces) > 1 and (len(set(own_names)) < len(own_names) or not all(of_file for _, of_file, _ in pieces)):
         found = f"both in {pieces[0][0]} and in {pieces[1][0]}"
         accepted = "every field but time in one of several files, or other joints or contacts in each"
         raise LogError.at_field(field, found, accepted)
     values = np.concatenate([x for *_, x in pieces], axis=1) if len(pieces) > 1 else pieces[0][2]
-    own = own or names
-    if own == names or values.ndim < 2:
+    own_names = own_names or names
+    if own_names == names or values.ndim < 2:
         return values
-    if missing := sorted(set(names) - set(own)):
-        of = names_field(field)
+    if missing := sorted(set(names) - set(own_names)):
+        kind_field = names_field(field)
         file = next((file for file in files if file.endswith(pieces[-1][0])), "")
         with about_file(file) if file else nullcontext():
-            accepted = (
-                f"the same {KINDS[of]}s in all files of a log, or in those that have {field} together, in any order"
-            )
-            raise LogError.at_field(of, f"'{missing[0]}' missing", accepted)
-    return np.asarray(values[:, [own.index(name) for name in names]])
+            where = f"in all files of a log, or in those that have {field} together, in any order"
+            accepted = f"the same {KINDS[kind_field]}s {where}"
+            raise LogError.at_field(kind_field, f"'{missing[0]}' missing", accepted)
+    return np.asarray(values[:, [own_names.index(name) for name in names]])
 
 
 def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Sequence[str]) -> list[Columns]:
@@ -340,7 +340,7 @@ def _stamped(raw: Fields, shift_s: float) -> Fields:
         raise LogError.at_field("time", "missing", "stamps in each of several files of a log")
     time = parse_time(raw["time"])
     out = {name: x for name, x in raw.items() if name not in NAME_FIELDS}
-    out |= {name: np.array(of, np.str_) for name in NAME_FIELDS if name in raw and (of := parse_names(name, raw[name]))}
+    out |= {name: np.array(x, np.str_) for name in NAME_FIELDS if name in raw and (x := parse_names(name, raw[name]))}
     if "joint_names" not in out and 0 in out.get("joint_position", time).shape[1:]:
         del out["joint_position"]  # what a table without joints has
     for name, array in out.items():

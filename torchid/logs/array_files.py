@@ -193,7 +193,9 @@ class _Hdf5(ServedArrays):
         ValueError where there are more than a log may have, as those of a group that contains itself; arrays of groups
         that differ in numbers, such as episodes, count once.
         """
-        sizes, count, groups = dict[str, int](), 0, [("", self._file)]
+        sizes = dict[str, int]()
+        count = 0
+        groups = [("", self._file)]
         for prefix, group in groups:
             count += len(group)
             if count > MAX_DATASETS:

@@ -46,11 +46,13 @@ class _Mcap:
     """An MCAP file in the process that reads it: of any profile, with or without an index, which rosbags refuses."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._size = path, max(path.stat().st_size, 1)
+        self._path = path
+        self._size = max(path.stat().st_size, 1)
 
     def channels(self) -> list[tuple[str, str, str]]:
         """As of `_Bag`."""
-        types, found = dict[int, str](), dict[int, Any]()
+        types = dict[int, str]()
+        found = dict[int, Any]()
         for record, _ in self._scan():
             if type(record).__name__ == "Schema":
                 package, _, message = record.name.partition("/")  # ROS 1 omits `msg`

@@ -43,7 +43,8 @@ Names = list[Name]
 _X = TypeVar("_X")
 _Three = tuple[Number, Number, Number]
 _GAINS = ("value", "column", "columns", "order", "first_index")
-_XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")
+_XYZ = ("x", "y", "z")
+_RPY = ("roll", "pitch", "yaw")
 
 
 def component_names(field: str) -> tuple[str, ...]:
@@ -59,7 +60,7 @@ def component_names(field: str) -> tuple[str, ...]:
 def names_field(field: str) -> str:
     """The field with the names of a field's columns (`joint_names`, ...), or ""."""
     letter = next((x for x in field_shape(field)[1:2] if isinstance(x, str)), None)
-    return next((name for name, of in NAME_FIELDS.items() if of == letter), "")
+    return next((name for name, letter_of_field in NAME_FIELDS.items() if letter_of_field == letter), "")
 
 
 def format_pattern(field: str) -> str:
@@ -373,7 +374,8 @@ def values_by_name(key: str, given: Mapping[str, _X], labels: Sequence[str]) -> 
     """
     out: dict[str, tuple[int, _X]] = {}
     for pattern, value in given.items():
-        letters, found = letters_of(pattern), [label for label in labels if fits(label, pattern)]
+        letters = letters_of(pattern)
+        found = [label for label in labels if fits(label, pattern)]
         if not found and letters:
             raise UnknownNameError.at_field(key, excerpt(pattern), labels)
         for label in found:
@@ -638,15 +640,17 @@ def as_in_file(value: Any, file: str, others: Collection[str] = ()) -> Any:
     if isinstance(value, str):
         return value.removeprefix(f"{file}{OF_FILE}")
     if isinstance(value, list):
-        return [as_in_file(one, file, others) for one in value]
+        return [as_in_file(item, file, others) for item in value]
     if isinstance(value, dict):
-        own = {key: as_in_file(one, file, others) for key, one in value.items()}
+        in_file = {key: as_in_file(item, file, others) for key, item in value.items()}
         elsewhere = tuple(f"{other}{OF_FILE}" for other in others if other != file)
-        kept = {key: one for key, one in own.items() if not (isinstance(one, str) and one.startswith(elsewhere))}
-        return kept or own
+        kept = {
+            key: item for key, item in in_file.items() if not (isinstance(item, str) and item.startswith(elsewhere))
+        }
+        return kept or in_file
     is_entry = dataclasses.is_dataclass(value) and not isinstance(value, type)
     return (
-        dataclasses.replace(value, **{key: as_in_file(one, file, others) for key, one in vars(value).items()})
+        dataclasses.replace(value, **{key: as_in_file(item, file, others) for key, item in vars(value).items()})
         if is_entry
         else value
     )

@@ -94,7 +94,7 @@ def list_bag_files(path: Path) -> list[Path]:
 def log_files(path: Path) -> list[Path]:
     """The files of a log, or of the one that it is a part of: several of a bag in a folder, or of joined files."""
     files = (file.path for file in split_range(path).files)
-    return [one for file in files for one in list_bag_files(file) or [file]]
+    return [part for file in files for part in list_bag_files(file) or [file]]
 
 
 def _kind(path: Path, accepted: tuple[str, ...]) -> LogKind:

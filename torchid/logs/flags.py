@@ -36,7 +36,8 @@ def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, Bool
         LogError: no force, or no flag either, of a contact; a force that is NaN in some samples; no normal of the
             ground where a contact stands.
     """
-    scalar, wrench = log.contact_force_normal, log.contact_wrench
+    scalar = log.contact_force_normal
+    wrench = log.contact_wrench
     if not log.contact_names or (scalar is None and wrench is None):
         accepted = f"contact_wrench_local or {FORCE_NORMAL}, to compare with {_KEY}"
         raise LogError(log.source, "contact_wrench", "missing", accepted)
@@ -53,7 +54,8 @@ def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, Bool
             found = f"nan at {describe_element((int(np.argmax(missing)), column), log.contact_names)}"
             accepted = f"forces to compare with {_KEY}, or gaps that preprocessing.bridge_gaps_s bridges"
             if missing.all():
-                found, accepted = f"no force of {name}", f"forces to compare with {_KEY}, or contact_active"
+                found = f"no force of {name}"
+                accepted = f"forces to compare with {_KEY}, or contact_active"
             is_scalar = scalar is not None and (wrench is None or not np.isnan(scalar[:, column]).all())
             raise LogError(log.source, FORCE_NORMAL if is_scalar else log.contact_wrench_field, found, accepted)
         loaded = hysteresis(force[:, column], settings.above, below)

@@ -52,7 +52,8 @@ def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dic
     Warns:
         TorchidWarning: how many samples were filled.
     """
-    out, filled = dict(raw), dict[str, BoolArray]()  # samples (N,) in which something was filled
+    out = dict(raw)
+    filled = dict[str, BoolArray]()  # samples (N,) in which something was filled
     if longest_s is None:
         return out
     time = parse_time(raw["time"])
@@ -133,9 +134,11 @@ def _filled(time: FloatArray, name: str, array: NDArray[Any], short: BoolArray) 
         values[short.any(axis=1)] = np.nan
         values = make_sign_continuous(values)
     for channel in np.ndindex(*values.shape[1:]):
-        column, of_channel = values[(slice(None), *channel)], short[(slice(None), *channel)]
+        column = values[(slice(None), *channel)]
+        of_channel = short[(slice(None), *channel)]
         for start, stop in runs(~np.isnan(column) | of_channel):
-            gaps, since = of_channel[start:stop], time[start:stop] - time[start]
+            gaps = of_channel[start:stop]
+            since = time[start:stop] - time[start]
             if gaps.any():
                 column[start:stop][gaps] = CubicSpline(since[~gaps], column[start:stop][~gaps])(since[gaps])
     if is_quaternion(name):
@@ -165,7 +168,8 @@ def turn_jumps(position: FloatArray, turn: float = _TURN) -> BoolArray:
     """
     steps = np.abs(np.diff(position, axis=0)) / turn
     with np.errstate(invalid="ignore"):
-        jumps, is_small = np.abs(steps - 1.0) < _TOLERANCE_TURNS, ~(steps >= _LARGEST_STEP_TURNS)
+        jumps = np.abs(steps - 1.0) < _TOLERANCE_TURNS
+        is_small = ~(steps >= _LARGEST_STEP_TURNS)
     around = np.pad(is_small, ((1, 1), (0, 0)), constant_values=True)
     jumps &= around[:-2] & around[2:]
     return np.asarray(jumps & (jumps | is_small).all(axis=1, keepdims=True))
@@ -209,7 +213,8 @@ def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
     Warns:
         TorchidWarning: names them.
     """
-    labels, broken = column_labels(name, log.names), list[str]()
+    labels = column_labels(name, log.names)
+    broken = list[str]()
     channel: tuple[int, ...]
     for channel in map(tuple, np.argwhere(coverage.broken).tolist()):
         samples = np.flatnonzero(np.moveaxis(coverage.missing, 0, -1)[channel])

@@ -277,8 +277,8 @@ def is_quaternion(name: str) -> bool:
 
 def column_labels(name: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     """Names of the columns of the field `name`; empty for fields without named columns; `names`: by `NAME_FIELDS`."""
-    of = f"{name.partition('_')[0]}_names"
-    return names[of] if of in NAME_FIELDS else ()
+    names_field = f"{name.partition('_')[0]}_names"
+    return names[names_field] if names_field in NAME_FIELDS else ()
 
 
 #: Deviation of the norm of a quaternion or a normal from 1 up to which it is normalised.

@@ -333,7 +333,8 @@ def unloaded_readings(log: Log, where: BoolArray | None = None) -> FloatArray | 
     """
     if log.contact_unloaded is not None:
         return log.contact_unloaded
-    wrench, scalar = log.contact_wrench, log.contact_force_normal
+    wrench = log.contact_wrench
+    scalar = log.contact_force_normal
     if (wrench is None and scalar is None) or log.contact_active is None:
         return None
     chosen = find_unloaded(log.time, log.contact_active) if where is None else where

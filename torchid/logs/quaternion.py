@@ -64,7 +64,8 @@ def quaternion_of_rpy(rpy: FloatArray, order: str) -> FloatArray:
 
 def rotate_to_world(quat_xyzw: FloatArray, vector_base: FloatArray) -> FloatArray:
     """Components (N, 3) in the world of vectors (N, 3) given in the base frame, for unit quaternions (N, 4)."""
-    axis, w = quat_xyzw[:, :3], quat_xyzw[:, 3:]
+    axis = quat_xyzw[:, :3]
+    w = quat_xyzw[:, 3:]
     turn = 2.0 * np.cross(axis, vector_base)
     return vector_base + w * turn + np.cross(axis, turn)
 
@@ -81,7 +82,10 @@ def rotate_to_base(quat_xyzw: FloatArray, vector_world: FloatArray) -> FloatArra
 
 def _divide(quat: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Vector (N, 3) and scalar (N, 1) part of quat^-1 other."""
-    v, w, v2, w2 = quat[:, :3], quat[:, 3:], other[:, :3], other[:, 3:]
+    v = quat[:, :3]
+    w = quat[:, 3:]
+    v2 = other[:, :3]
+    w2 = other[:, 3:]
     square = np.sum(quat * quat, axis=1, keepdims=True)
     return (w * v2 - w2 * v - np.cross(v, v2)) / square, (w * w2 + np.sum(v * v2, axis=1, keepdims=True)) / square
 

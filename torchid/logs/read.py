@@ -27,7 +27,6 @@ from torchid.logs.containers import (
     save_arrays,
 )
 from torchid.logs.episodes import EpisodeArrays
-from torchid.logs.force_plates import about_world_origin
 from torchid.logs.gaps import bridge_gaps, refuse_gaps
 from torchid.logs.log import (
     CONTACT_READINGS,
@@ -41,6 +40,7 @@ from torchid.logs.log import (
     REQUIRED_WITH,
     SHAPES,
     VARIANTS,
+    WRENCHES,
     FloatArray,
     Log,
     check_finite,
@@ -100,7 +100,8 @@ def read_log(
     if columns is not None and not isinstance(columns, Columns):
         raise TypeError(f"columns: found {type(columns).__name__}; accepted: torchid.Columns(joint_position=...)")
     with during("reading", os.fspath(path)):
-        part, kept = split_range(path), _last_file.get()
+        part = split_range(path)
+        kept = _last_file.get()
         read = kept.read if kept is not None and isinstance(part.range, Recording) else _read_raw
         raw = read(path, topics, progress, columns, bridge_gaps_s, needs_flags)
         raw = raw if part.range is None else _cut(raw, part.range)
@@ -130,8 +131,10 @@ class _LastFile:
         state = os.stat(file) if os.path.exists(file) else None
         key = (file, state and (state.st_ino, state.st_size, state.st_mtime_ns), how)
         if key != self._key:
-            self._key, self._raw = None, {}  # before the next: there is never more than one
-            self._raw, self._key = _read_raw(path, *how), key
+            self._key = None
+            self._raw = {}  # before the next: there is never more than one
+            self._raw = _read_raw(path, *how)
+            self._key = key
         return dict(self._raw)
 
 
@@ -160,9 +163,9 @@ def read_recordings(
             return [build_log(raw, allow_gaps=True)]
     logs = []
     for number in range(len(starts)):
-        one = Recording(f"[#{number}]", number)
-        with during("reading", f"{os.fspath(path)}{one.text}"):
-            logs.append(build_log(_cut(raw, one), allow_gaps=True))
+        recording = Recording(f"[#{number}]", number)
+        with during("reading", f"{os.fspath(path)}{recording.text}"):
+            logs.append(build_log(_cut(raw, recording), allow_gaps=True))
     return logs
 
 
@@ -175,7 +178,8 @@ def _read_raw(
     needs_flags: bool,
 ) -> dict[str, NDArray[Any]]:
     """The fields of all of a file, or of several, as they are there."""
-    part, check = split_range(path), partial(check_fields_given, needs_flags=needs_flags)
+    part = split_range(path)
+    check = partial(check_fields_given, needs_flags=needs_flags)
     kind = existing_log_kind(part.file)
     if kind is LogKind.ARRAYS:
         return _read_arrays(part.file, columns, check)
@@ -194,10 +198,54 @@ def build_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
     return _to_canonical(_check_values(about_world_origin(raw), allow_gaps))
 
 
+_PLATE_WRENCH = WRENCHES[1]
+
+
+def about_world_origin(raw: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The fields of a file with moments about the world's origin, m + p x f, where it has the points p of these.
+
+    A centre of pressure is a point p; only the vertical component of m, the free moment, is then not 0. Moments about a
+    point that does not move are linear in what a plate measures: they can be interpolated and filtered, which a centre
+    of pressure cannot, and no motion is needed for them.
+
+    Nothing acts without a force: where this is exactly 0, or the contact is not active, a point may be NaN and a moment
+    of NaN is then 0. Elsewhere a moment about an unknown point is not known, NaN.
+
+    Args:
+        raw: arrays by field; afterwards the points are the world's origin.
+
+    Raises:
+        LogError: points or wrenches of another shape, or points that are infinite.
+    """
+    if POINTS not in raw or _PLATE_WRENCH not in raw:
+        return raw
+    check_shape("time", raw["time"], SHAPES["time"], {})
+    samples = {"N": len(raw["time"])}
+    check_shape(_PLATE_WRENCH, raw[_PLATE_WRENCH], SHAPES[_PLATE_WRENCH], samples)
+    check_shape(POINTS, raw[POINTS], SHAPES[POINTS], samples | {"C": raw[_PLATE_WRENCH].shape[1]})
+    wrench = to_float64(_PLATE_WRENCH, raw[_PLATE_WRENCH])
+    points = to_float64(POINTS, raw[POINTS])
+    if not points.any():
+        return raw
+    force = wrench[..., :3]
+    moment = wrench[..., 3:]
+    idle = (force == 0.0).all(axis=2)
+    unknown = ~np.isfinite(points).all(axis=2)
+    check_finite(POINTS, np.where(idle[..., None], 0.0, points), allow_nan=True)
+    with np.errstate(invalid="ignore", over="ignore"):  # infinite forces are refused with the log
+        arms = np.where((idle | ~points.any(axis=2))[..., None], 0.0, np.cross(points, force))
+    moved = moment + arms
+    if FLAGS in raw and raw[FLAGS].shape == idle.shape:
+        idle = idle | (raw[FLAGS] == 0)
+    moved[(idle & unknown)[..., None] & np.isnan(moved)] = 0.0
+    return raw | {_PLATE_WRENCH: np.concatenate([force, moved], axis=2), POINTS: np.zeros_like(points)}
+
+
 def _cut(raw: dict[str, NDArray[Any]], range_: TimeRange | Recording) -> dict[str, NDArray[Any]]:
     """The fields of a file with the samples of a part alone; LogError where their numbers differ."""
     time = _stamps(raw)
-    samples, out = range_.select(time), dict(raw)
+    samples = range_.select(time)
+    out = dict(raw)
     for name, array in raw.items():
         if field_shape(name)[:1] == ("N",):
             if array.shape[:1] != time.shape:
@@ -290,7 +338,8 @@ def _check_values(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, A
         if name == FLAGS:
             fields[name] = parse_flags(name, array, labels)
             continue
-        values, may_be_nan = to_float64(name, array), allow_gaps or name in (*NAN_ALLOWED, NORMALS)
+        values = to_float64(name, array)
+        may_be_nan = allow_gaps or name in (*NAN_ALLOWED, NORMALS)
         if not may_be_nan and np.isnan(values).any():
             refuse_gaps(name, values, time, labels)
         check_finite(name, values, allow_nan=may_be_nan, labels=labels)

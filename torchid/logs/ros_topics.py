@@ -280,8 +280,8 @@ def _check_low_state(topics: Topics, low_state: LowStateTopic) -> None:
     if low_state.robot is not None and low_state.robot not in JOINT_ORDERS:
         raise UnknownNameError.at_field(f"{key}.robot", low_state.robot, JOINT_ORDERS)
     for name, given in (("joints", low_state.order), ("feet", low_state.feet or ())):
-        names = [one for one in given if one is not None]
-        again = [one for one in names if names.count(one) > 1]
+        names = [name for name in given if name is not None]
+        again = [name for name in names if names.count(name) > 1]
         if again or (given and not names):
             found = f"'{excerpt(again[0])}' twice" if again else "no name"
             raise ConfigError.at_field(f"{key}.{name}", found, "every name once, null for what is left out")
@@ -316,13 +316,16 @@ def require_joints(topics: Topics | None, joints: Collection[str]) -> None:
     Raises:
         InputError: one is not; the message names the robots that it could be.
     """
-    called = [] if topics is None else [(key, x) for key, of in topics.joint_topics.items() for x in of.names.values()]
+    called = (
+        [] if topics is None else [(key, x) for key, topic in topics.joint_topics.items() for x in topic.names.values()]
+    )
     for role, joint in called:
         if joint not in joints:
             raise UnknownNameError.at_field(f"logs.topics.{role}.names", joint, joints)
     if topics is None or topics.low_state is None:
         return
-    low_state, key = topics.low_state, "logs.topics.low_state"
+    low_state = topics.low_state
+    key = "logs.topics.low_state"
     if low_state.robot is not None:
         require_joints_of(f"{key}.robot", low_state.robot, joints)
     for name in low_state.order:

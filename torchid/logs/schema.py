@@ -58,7 +58,8 @@ from torchid.logs.units import IN_DEGREES, unit_factor
 Take = Callable[[str], NDArray[Any]]
 """The values (N, ...) of a column or an array."""
 
-_PD, _CURRENT = "joint_torque.pd", "joint_torque.current"
+_PD = "joint_torque.pd"
+_CURRENT = "joint_torque.current"
 _UNIT = re.compile(r"\[.*\]$|\(.*\)$")
 
 
@@ -105,8 +106,11 @@ class _Search:
         given: Sequence[str],
         named: Mapping[str, tuple[str, ...]],
     ) -> None:
-        self._columns, self._given, self._named = columns, given, named
-        self._known, self.left_out = set(given), set[str]()
+        self._columns = columns
+        self._given = given
+        self._named = named
+        self._known = set(given)
+        self.left_out = set[str]()
         stated = {key: self._by_stated_names(part) for key, part in parts.items()}
         self._stated = {key: matched for key, matched in stated.items() if matched is not None}
         self._free = {key: part for key, part in parts.items() if key not in self._stated}
@@ -267,7 +271,8 @@ class EntryReader:
 
     def __init__(self, matched: Matched, names: Sequence[str]) -> None:
         """For names in the order of the log; ConfigError for a unit of another quantity."""
-        self.matched, part = matched, matched.part
+        self.matched = matched
+        part = matched.part
         places = {label: place for place, label in enumerate(matched.labels)}
         order = [places.get(name, -1) for name in names]
         self._order = None if order == list(range(len(matched.labels))) else order
@@ -280,7 +285,8 @@ class EntryReader:
         Raises:
             LogError: a column of another shape or of no numbers.
         """
-        matched, part = self.matched, self.matched.part
+        matched = self.matched
+        part = self.matched.part
         arrays = [self._numbers(column, take(column)) for column in matched.columns]
         for column, array in zip(matched.columns, arrays, strict=True):
             if len(array) != len(arrays[0]):
@@ -307,7 +313,8 @@ class EntryReader:
         return whole
 
     def _numbers(self, column: str, array: NDArray[Any]) -> FloatArray:
-        matched, part = self.matched, self.matched.part
+        matched = self.matched
+        part = self.matched.part
         if array.dtype.kind == "U" and part.key == "contact_active":
             array = _flags_of_words(column, array)
         if array.dtype.kind not in "fiub":
@@ -489,7 +496,7 @@ class FileFields:
 
     def text(self, take: Take) -> dict[str, NDArray[Any]]:
         """Names, and the IMU's frame."""
-        out: dict[str, NDArray[Any]] = {name: np.array(of, dtype=np.str_) for name, of in self.names.items()}
+        out: dict[str, NDArray[Any]] = {name: np.array(names, dtype=np.str_) for name, names in self.names.items()}
         if self.columns.imu_frame is not None:
             out[TEXT_FIELD] = np.array(self.columns.imu_frame)
         elif self.frame_column:
@@ -544,8 +551,9 @@ class FileFields:
         for gain, desired, measured in (("kp", "position", "joint_position"), ("kd", "velocity", "joint_velocity")):
             gains = self._gains(gain, take)
             if gains is not None:
-                own, key = self.value(measured, take), f"{_PD}.{desired}"
-                terms.append(gains * (self.readers[key].read(take) - own if key in self.readers else -own))
+                actual = self.value(measured, take)
+                key = f"{_PD}.{desired}"
+                terms.append(gains * (self.readers[key].read(take) - actual if key in self.readers else -actual))
         if f"{_PD}.feed_forward" in self.readers:
             terms.append(self.readers[f"{_PD}.feed_forward"].read(take))
         return np.asarray(sum(terms[1:], terms[0]))
@@ -563,7 +571,8 @@ class FileFields:
         """Stated gains (1, n), or read ones (N, n); None without any, and for read ones that nothing is to be read."""
         gains: Gains | None = getattr(getattr(self.columns.joint_torque, "pd", None), name, None)
         if gains is not None and gains.value:
-            key, joints = f"{KEY}.{_PD}.{name}", self.names["joint_names"]
+            key = f"{KEY}.{_PD}.{name}"
+            joints = self.names["joint_names"]
             return np.array([values_of_all(key, "gain", gains.value, "joint", joints)])
         return None if gains is None or take is None else self.readers[f"{_PD}.{name}"].read(take)
 
@@ -634,7 +643,8 @@ def match_table(columns: Columns | None, header: Sequence[str], in_degrees: bool
         raise LogError.at_field(f"{KEY}.episodes", "given for a table", "arrays: stamps of a table begin anew")
     fields = _match(columns, header, {"joint_names": ()}, True)
     for reader in fields.readers.values() if in_degrees else ():
-        part, names = reader.matched.part, fields.names.get(reader.matched.part.names_field, ())
+        part = reader.matched.part
+        names = fields.names.get(reader.matched.part.names_field, ())
         turning = [
             label for label, axis in _element_labels(part, names) if IN_DEGREES.keys() & set(part.quantities[axis])
         ]
@@ -673,7 +683,8 @@ def _match(
     columns: Columns | None, given: Sequence[str], named: Mapping[str, tuple[str, ...]], is_table: bool
 ) -> FileFields:
     """The fields of a file with some columns or arrays; `named`: names that it states itself."""
-    has_map, columns = columns is not None, Columns() if columns is None else columns
+    has_map = columns is not None
+    columns = Columns() if columns is None else columns
     check_columns(columns)
     columns = columns_of_file(columns, given)
     parts = list_parts(columns)
@@ -681,30 +692,31 @@ def _match(
     native = {text: field for text, field in native.items() if field in (*SHAPES, *VARIANTS)}
     search = _Search(columns, parts, given, named if not is_table else {})
     if parts and not search.finds_any and len(native) == len(given):  # a map of other files
-        parts, columns = {}, Columns()
+        parts = {}
+        columns = Columns()
     matched = {key: search.match(part) for key, part in parts.items()}
     taken = search.left_out if parts else set()
-    taken = taken | {column for one in matched.values() for column in one.columns}
+    taken = taken | {column for match in matched.values() for column in match.columns}
     others = [text for text in given if text not in taken]
     if unknown := [x for x in others if x not in native and not any(fits(x, pattern) for pattern in columns.ignore)]:
         raise unknown_columns(unknown, has_map)
-    own = {x: native[x] for x in others if x in native and not _is_ignored(columns, x)}
-    for text, field in own.items():
+    native_columns = {x: native[x] for x in others if x in native and not _is_ignored(columns, x)}
+    for text, field in native_columns.items():
         if field in columns.fields or (field == TEXT_FIELD and columns.imu_frame is not None):
             raise LogError.at_field(f"{KEY}.{field}", f"beside '{text}'", f"one of the two, the other in {KEY}.ignore")
     if is_table:
-        of_format = {field: native_part(field) for field in COLUMN_FIELDS if field in own.values()}
+        of_format = {field: native_part(field) for field in COLUMN_FIELDS if field in native_columns.values()}
         of_format.pop(TEXT_FIELD, None)
-        search = _Search(Columns(), of_format, list(own), {})
+        search = _Search(Columns(), of_format, list(native_columns), {})
         matched |= {key: search.match(part) for key, part in of_format.items()}
     _require_once(matched)
     names = _common_names(columns, matched, named)
     names = names if parts or not is_table else {"joint_names": (), **names}
-    readers = {key: EntryReader(one, names.get(one.part.names_field, ())) for key, one in matched.items()}
-    arrays = () if is_table else tuple(x for x in own if x not in (*NAME_FIELDS, TEXT_FIELD))
+    readers = {key: EntryReader(match, names.get(match.part.names_field, ())) for key, match in matched.items()}
+    arrays = () if is_table else tuple(x for x in native_columns if x not in (*NAME_FIELDS, TEXT_FIELD))
     if has_map and parts:
         names = {"joint_names": (), **names}
-    return FileFields(names, columns, readers, arrays, TEXT_FIELD if TEXT_FIELD in own else "").check()
+    return FileFields(names, columns, readers, arrays, TEXT_FIELD if TEXT_FIELD in native_columns else "").check()
 
 
 def _is_ignored(columns: Columns, text: str) -> bool:
@@ -730,11 +742,11 @@ def _named_fields(text: str, given: Collection[str], load: Take) -> list[str]:
 def _require_once(matched: Mapping[str, Matched]) -> None:
     """Refuse a column with two entries."""
     owners: dict[str, str] = {}
-    for key, one in matched.items():
-        for column in one.columns:
+    for key, match in matched.items():
+        for column in match.columns:
             if column in owners:
                 found = f"column '{excerpt(column)}', which {KEY}.{owners[column]} has already"
-                raise LogError.at_field(one.part.where, found, "every column once")
+                raise LogError.at_field(match.part.where, found, "every column once")
             owners[column] = key
 
 
@@ -742,11 +754,11 @@ def _common_names(
     columns: Columns, matched: Mapping[str, Matched], named: Mapping[str, tuple[str, ...]]
 ) -> dict[str, tuple[str, ...]]:
     """Names of joints, contacts and sensors: those that the file states, else of the first entry, of torques last."""
-    listed = [(one.part.where, one.part.names_field, one.names) for one in matched.values() if one.part.kind]
+    listed = [(match.part.where, match.part.names_field, match.names) for match in matched.values() if match.part.kind]
     if columns.contact_active is not None and columns.contact_active.always:
         listed.append((f"{KEY}.contact_active.always", "contact_names", tuple(columns.contact_active.always)))
     names = {field: of_file for field, of_file in named.items() if of_file}
-    for key, field, of_part in sorted(listed, key=lambda one: "joint_torque" in one[0]):
+    for key, field, of_part in sorted(listed, key=lambda item: "joint_torque" in item[0]):
         common = names.setdefault(field, of_part)
         is_set = len(set(of_part)) == len(of_part)
         again = [] if is_set else [name for name in of_part if of_part.count(name) > 1]

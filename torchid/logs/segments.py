@@ -45,9 +45,9 @@ def _is_long_enough(time: FloatArray, segment: slice, whole: Timeline) -> bool:
     if whole.low_pass is None or whole.cutoff_hz is None:
         return True
     step = float(np.median(np.diff(time)))
-    left = time[segment.stop - 1] - time[segment.start] - 2.0 * DROPPED_PERIODS / whole.cutoff_hz
+    kept_s = time[segment.stop - 1] - time[segment.start] - 2.0 * DROPPED_PERIODS / whole.cutoff_hz
     wanted = step * (whole.kept.step or 1) if whole.output is None else float(np.median(np.diff(whole.output)))
-    return bool(left > 2.0 * max(step, wanted) and count > 2 * whole.low_pass.padding)
+    return bool(kept_s > 2.0 * max(step, wanted) and count > 2 * whole.low_pass.padding)
 
 
 def with_delayed_torques(log: Log, delay: float) -> Log:
@@ -92,9 +92,9 @@ def recorded_at_delays(time: FloatArray, delays: Sequence[float | FloatArray]) -
     """Stamps (N,) [s] that are, by each of some delays [s] or (N,), within what was recorded without a break, (N,)."""
     kept = np.zeros(len(time), dtype=bool)
     for segment in unbroken_segments(time):
-        own = time[segment]
-        earlier = [own - (delay[segment] if isinstance(delay, np.ndarray) else delay) for delay in delays]
-        kept[segment] = np.all([(at >= own[0]) & (at <= own[-1]) for at in earlier], axis=0)
+        stamps = time[segment]
+        earlier = [stamps - (delay[segment] if isinstance(delay, np.ndarray) else delay) for delay in delays]
+        kept[segment] = np.all([(at >= stamps[0]) & (at <= stamps[-1]) for at in earlier], axis=0)
     return kept
 
 

@@ -60,7 +60,8 @@ def signal_noise(log: Log, timeline: Timeline | None, stated: Mapping[str, float
         stated: standard deviations by `STATED_FIELDS`' keys, 0 for none.
     """
     known = {name: value for key, value in (stated or {}).items() for name in STATED_FIELDS[key]}
-    start, std = log.select(slice(0, MOST_SAMPLES)), dict[str, FloatArray]()
+    start = log.select(slice(0, MOST_SAMPLES))
+    std = dict[str, FloatArray]()
     for name in MOTION_FIELDS:
         values: FloatArray | None = getattr(start, name)
         if values is None or not values.size and name != "joint_position":
@@ -188,7 +189,7 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline,
     Warns:
         TorchidWarning: one, with a lower cutoff that would do, or that no joint moves.
     """
-    noisy = sorted(_noise_shares(log, preprocessed, noise), key=lambda one: -one[1])
+    noisy = sorted(_noise_shares(log, preprocessed, noise), key=lambda item: -item[1])
     if not noisy:
         return
     if _stands_still(log, noise):

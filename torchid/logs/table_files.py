@@ -19,7 +19,8 @@ from torchid.logs.containers import JSON_LINES, OPENSIM, TEXT_TABLES
 from torchid.logs.log import TEXT_FIELD
 
 _BLOCK_BYTES = 2**22  # of text that is parsed at a time; no row may be longer
-_BATCH_ROWS, _SAMPLE_ROWS = 2**16, 2**12
+_BATCH_ROWS = 2**16
+_SAMPLE_ROWS = 2**12
 _HEADER_LINES, _OPENSIM_LINES = 64, 1000  # before the first row
 _MAX_COLUMN_LETTERS = 2 * MAX_LETTERS  # the name of a column contains that of a joint
 _PARQUET = {  # limits on metadata: bytes of names and statistics, entries of lists
@@ -105,7 +106,8 @@ def read_header(path: Path) -> TextHeader:
     row = texts[first] if first < len(texts) else ""
     title = "" if named is None else _COMMENT.sub("", texts[named])
     separator = _separator(row or title)
-    cells, names = _cells(row, separator), [cell.strip() for cell in _cells(title, separator)]
+    cells = _cells(row, separator)
+    names = [cell.strip() for cell in _cells(title, separator)]
     if named is None:
         counts = len(cells) > 1 and [cell.strip() for cell in cells] == [str(k) for k in range(len(cells))]
         first += counts  # as pandas counts the columns
@@ -227,7 +229,9 @@ class _Served:
     """A table in the process that reads it. Nested columns are columns: `state.q` of structures, `q[0]` of lists."""
 
     def __init__(self, path: Path) -> None:
-        self._pa, self._path, self._columns = import_pyarrow(path), path, 0
+        self._pa = import_pyarrow(path)
+        self._path = path
+        self._columns = 0
         self._header = read_header(path) if is_text_table(path) else None
         self._lengths = dict[str, int]()  # numbers in each row of columns of lists
         self._origin = dict[str, str]()  # of a column of numbers, the column of lists
@@ -270,7 +274,8 @@ class _Served:
         Raises:
             LogError: a cell that is no number, or a file that is too large.
         """
-        self._columns, rows = len(sources), 0
+        self._columns = len(sources)
+        rows = 0
         for table in self._tables(sources, texts):
             rows += table.num_rows
             self._check_size(rows, whole)
@@ -327,7 +332,8 @@ class _Served:
 
     def _csv_type(self, name: str, is_text: bool) -> Any:
         """That of a column: the inferred one of dates, truth values and allowed texts, else numbers."""
-        types, inferred = self._pa.types, self._first.schema.field(name).type
+        types = self._pa.types
+        inferred = self._first.schema.field(name).type
         is_kept = types.is_temporal(inferred) or types.is_boolean(inferred) or (is_text and types.is_string(inferred))
         if is_text and name == TEXT_FIELD:
             return self._pa.string()
@@ -399,7 +405,8 @@ class _Served:
 
     def _numbers_of_lists(self, name: str, column: Any) -> NDArray[Any] | None:
         """Numbers (N, k) of a column of lists, NaN where there is no list; None of others than lists of numbers."""
-        types, type_ = self._pa.types, column.type
+        types = self._pa.types
+        type_ = column.type
         is_list = types.is_list(type_) or types.is_large_list(type_) or types.is_fixed_size_list(type_)
         if not is_list or not types.is_primitive(type_.value_type):
             return None
@@ -421,7 +428,8 @@ class _Served:
 
     def _values(self, name: str, column: Any) -> NDArray[Any] | None:
         """Numbers (N,) of a column, of dates seconds since 1970, NaN for empty cells; or texts; None for others."""
-        types, type_ = self._pa.types, column.type
+        types = self._pa.types
+        type_ = column.type
         if types.is_null(type_):
             return np.full(len(column), np.nan)
         if types.is_timestamp(type_) or types.is_time(type_) or types.is_duration(type_):

@@ -45,7 +45,8 @@ class _Bound:
         return False if self == _END or other == _START else None
 
 
-_START, _END = _Bound("start", 0.0), _Bound("end", 0.0)
+_START = _Bound("start", 0.0)
+_END = _Bound("end", 0.0)
 
 
 @dataclass(frozen=True)
@@ -79,8 +80,10 @@ class TimeRange:
         check_time(time)
         since = time - time[0]
         step = float(np.median(np.diff(since))) if len(since) > 1 else 0.0
-        length, slack = float(since[-1]) + step, _SLACK * step
-        start, stop = self.start.at(length), self.stop.at(length)
+        length = float(since[-1]) + step
+        slack = _SLACK * step
+        start = self.start.at(length)
+        stop = self.stop.at(length)
         first, last = (int(np.searchsorted(since, bound - slack)) for bound in (start, stop))
         inside = -slack <= start and stop <= length + slack
         if not inside or first >= last:
@@ -143,20 +146,21 @@ def recording_starts(time: FloatArray) -> list[int]:
 
 def each_recording(name: str) -> list[str]:
     """The names of the recordings that a name such as `walk.npz[#2:40]` stands for; itself for any other."""
-    file, bracket, rest = name.rpartition("[")
-    if (found := _RECORDINGS.fullmatch(bracket + rest)) is None:
+    file, bracket, inside = name.rpartition("[")
+    if (found := _RECORDINGS.fullmatch(bracket + inside)) is None:
         return [name]
     first, stop = (int(x) for x in found.groups())
     return [f"{file}[#{k}]" for k in range(first, min(stop, first + _MOST_RECORDINGS))]
 
 
-def share_samples(one: TimeRange | Recording | None, other: TimeRange | Recording | None) -> bool | None:
+def share_samples(part: TimeRange | Recording | None, other: TimeRange | Recording | None) -> bool | None:
     """Whether two parts of a log overlap (None: all of it); None where that depends on how long the log is."""
-    if one is None or other is None:
+    if part is None or other is None:
         return True
-    if isinstance(one, Recording) or isinstance(other, Recording):
-        return one == other
-    early, late = one.start.is_before(other.stop), other.start.is_before(one.stop)
+    if isinstance(part, Recording) or isinstance(other, Recording):
+        return part == other
+    early = part.start.is_before(other.stop)
+    late = other.start.is_before(part.stop)
     return False if early is False or late is False else None if None in (early, late) else True
 
 
@@ -179,7 +183,8 @@ class LogFile:
 
 def join_files(files: Sequence[LogFile]) -> str:
     """The name of several files as one log; all but the first by how they lie in its folder, if they do."""
-    folder, names = files[0].path.parent, [str(files[0].path)]
+    folder = files[0].path.parent
+    names = [str(files[0].path)]
     for file in files[1:]:
         beside = file.path.is_relative_to(folder)
         names.append(str(file.path.relative_to(folder) if beside else file.path))

@@ -153,8 +153,8 @@ class Timeline:
             kept = [values[self.kept] for values in smoothed]
             if len(orders) == 1:
                 return [[values] for values in kept]
-            rest = joint_spline_derivatives(self.grid, smoothed, self.output_stamps, orders[1:])
-            return [[values, *derivatives] for values, derivatives in zip(kept, rest, strict=True)]
+            derived = joint_spline_derivatives(self.grid, smoothed, self.output_stamps, orders[1:])
+            return [[values, *derivatives] for values, derivatives in zip(kept, derived, strict=True)]
         return joint_spline_derivatives(self.grid, smoothed, self.output_stamps, orders)
 
     def hold(self, values: FloatArray) -> FloatArray:
@@ -185,7 +185,8 @@ class Timeline:
 def nearest_known(normals: FloatArray) -> FloatArray:
     """Normals (N, C, 3), where NaN those of the nearest sample in which they are known: filters widen contacts."""
     out = normals.copy()
-    known, every = np.asarray(np.isfinite(normals).all(axis=2)), np.arange(len(normals))
+    known = np.asarray(np.isfinite(normals).all(axis=2))
+    every = np.arange(len(normals))
     for contact in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)):
         samples = np.flatnonzero(known[:, contact])
         after = np.searchsorted(samples, every).clip(0, len(samples) - 1)
@@ -201,7 +202,8 @@ def nearest_known(normals: FloatArray) -> FloatArray:
 #: the first sample than inside the log, 2.4 times more at the second and 1.3 times at the third.
 DROPPED_SAMPLES = 2
 #: Fewest samples that can be filtered, or differentiated so that some are left.
-FEWEST_FILTERED, FEWEST_DIFFERENTIATED = 2, 2 * DROPPED_SAMPLES + 1
+FEWEST_FILTERED = 2
+FEWEST_DIFFERENTIATED = 2 * DROPPED_SAMPLES + 1
 #: Longest step, in median steps, across which a spline is drawn.
 LONGEST_STEP = 10.0
 #: A step shorter than this, in median steps, is worth a warning.
@@ -240,7 +242,8 @@ def lay_out_timeline(
         raise LogError.at_field("time", format_count(len(time), "sample"), accepted)
     native = time - time[0]
     step = _median_step(native)
-    grid, low_pass = native, None
+    grid = native
+    low_pass = None
     dropped = DROPPED_SAMPLES if differentiates else 0
     kept = slice(dropped, len(native) - dropped)
     if cutoff_hz is not None:
@@ -286,7 +289,8 @@ def _median_step(native: FloatArray) -> float:
     """The median step [s]; LogError on a step too long to draw a spline across, a warning on very short ones."""
     steps = np.diff(native)
     step = float(np.median(steps))
-    longest, shortest = int(np.argmax(steps)), int(np.argmin(steps))
+    longest = int(np.argmax(steps))
+    shortest = int(np.argmin(steps))
     if steps[longest] > LONGEST_STEP * step:
         found = f"a step of {steps[longest]:.6g} s after sample {longest}"
         accepted = f"steps of at most {LONGEST_STEP:g} times the median of {step:.6g} s; split the log there"
@@ -318,10 +322,10 @@ def _unspoiled(grid: FloatArray, step: float, cutoff_hz: float, padding: int) ->
 
 def _share_kept(grid: FloatArray, step: float) -> int | None:
     """Every how many-th stamp of a uniform grid makes one of another step [s]; None where none does."""
-    own = float(grid[-1] - grid[0]) / (len(grid) - 1)
-    each = max(round(step / own), 1)
-    uniform = np.abs(np.diff(grid) - own).max() <= JITTER * own
-    return each if uniform and abs(step / (each * own) - 1.0) <= JITTER else None
+    grid_step = float(grid[-1] - grid[0]) / (len(grid) - 1)
+    each = max(round(step / grid_step), 1)
+    uniform = np.abs(np.diff(grid) - grid_step).max() <= JITTER * grid_step
+    return each if uniform and abs(step / (each * grid_step) - 1.0) <= JITTER else None
 
 
 def _uniform(kept: FloatArray, rate_hz: float) -> FloatArray:

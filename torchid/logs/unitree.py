@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     pass
 
 
-GO, HG = "unitree_go/msg/LowState", "unitree_hg/msg/LowState"
+GO = "unitree_go/msg/LowState"
+HG = "unitree_hg/msg/LowState"
 MOTORS = {GO: 20, HG: 35}
 """Motors in a message of a type, used or not."""
 

@@ -8,7 +8,10 @@ import re
 from torchid.errors import ConfigError, excerpt
 from torchid.parameters import WRENCH_COMPONENTS
 
-_DEG, _TURN, _GRAVITY, _POUND = math.pi / 180.0, 2.0 * math.pi, 9.80665, 4.4482216152605
+_DEG = math.pi / 180.0
+_TURN = 2.0 * math.pi
+_GRAVITY = 9.80665
+_POUND = 4.4482216152605
 
 #: What a unit is in SI units, by the quantity that it is one of. Spaces, dots and powers are written in many ways: see
 #: `_plain`. A kg of force is what a load cell shows under that mass; one of torque is a kg of force with a lever.
@@ -171,17 +174,17 @@ def units_of_derivative_ratio(ratio: float, field: str, base: str, order: int | 
         base: units_of_ratio(1.0 / ratio, quantities_of(base)),
         "time": units_of_ratio(ratio ** (1.0 / order), ("time",)) if order else (),
     }
-    return {of: units for of, units in found.items() if units}
+    return {name: units for name, units in found.items() if units}
 
 
 def describe_units(found: dict[str, tuple[str, ...]]) -> str:
     """Text: 'joint_velocity is in deg/s, or time is in ms'."""
-    return ", or ".join(f"{of} is in {' or '.join(units)}" for of, units in found.items())
+    return ", or ".join(f"{name} is in {' or '.join(units)}" for name, units in found.items())
 
 
 def advise_units(found: dict[str, tuple[str, ...]]) -> str:
     """What to write in a map of columns: 'logs.columns.time.unit: ms'."""
-    return " or ".join(f"logs.columns.{of}.unit: {' or '.join(units)}" for of, units in found.items())
+    return " or ".join(f"logs.columns.{name}.unit: {' or '.join(units)}" for name, units in found.items())
 
 
 def other_units(quantity: str) -> dict[str, float]:

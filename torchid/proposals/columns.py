@@ -165,7 +165,11 @@ def find_families(sample: FileSample, robot: RobotNames) -> tuple[list[Family], 
 
 def _parts(text: str, spelled: Mapping[str, Spelling]) -> dict[str, Any]:
     """A column's name with placeholders, and what was in their places."""
-    full, name, kind, number, axis = text.removesuffix(TRANSPOSED), "", "", "", ""
+    full = text.removesuffix(TRANSPOSED)
+    name = ""
+    kind = ""
+    number = ""
+    axis = ""
     inside = [(stem, kind) for kind in spelled for stem in spelled[kind].names if within(stem).search(full)]
     if inside:
         name, kind = max(inside, key=lambda pair: len(pair[0]))
@@ -177,12 +181,14 @@ def _parts(text: str, spelled: Mapping[str, Spelling]) -> dict[str, Any]:
         number = match[0]
         stem = f"{stem[: match.start()]}{{index}}{stem[match.end() :]}"
     if axes := list(_AXIS.finditer(PLACEHOLDER.sub(lambda x: "\0" * len(x[0]), stem))):
-        axis, place = axes[-1][1] or axes[-1][2], axes[-1].end() - 1
+        axis = axes[-1][1] or axes[-1][2]
+        place = axes[-1].end() - 1
         before, inner = split_unit(stem[:place].rstrip("_./ "))
         stem = f"{stem[:place]}{{{'axis' if axis.islower() else 'AXIS'}}}{stem[place + 1 :]}"
         words = [re.sub(r"^([a-z])[wxyz]$", r"\1x", x) for x in words if not re.fullmatch("[wxyz]", x)]
         if inner and not unit and quantity_of(join_pairs(words_of(before))):  # of acc_g.x
-            unit, words = inner, words_of(before)
+            unit = inner
+            words = words_of(before)
     parts = {"stem": stem if kind else stem + tail, "pattern": stem + tail, "words": tuple(join_pairs(words))}
     return parts | {"name": name, "kind": kind, "number": number, "axis": axis.lower(), "unit": unit}
 
@@ -209,7 +215,9 @@ def _family(members: Sequence[Mapping[str, Any]], spelled: Mapping[str, Spelling
 
 class _Proposer:
     def __init__(self, sample: FileSample, robot: RobotNames, files: Sequence[FileSample]) -> None:
-        self.sample, self.robot, self.files = sample, robot, files
+        self.sample = sample
+        self.robot = robot
+        self.files = files
         native = {name for name in sample if native_field(name) or name in (*SHAPES, *VARIANTS)}
         self.foreign = {name: x for name, x in sample.items() if name not in native}
         numeric = {name: x for name, x in self.foreign.items() if x is not None and x.dtype.kind in "fiub" and x.size}
@@ -408,7 +416,8 @@ class _Proposer:
         feet = len(self.robot.feet)
         for family in self.families if feet and not self._known(WRENCHES[0]) and not self._known(WRENCHES[1]) else ():
             of_all = family.kind == "contact" and len(family.names) == feet
-            axes, shape = "".join(sorted(family.axes)), family.shape
+            axes = "".join(sorted(family.axes))
+            shape = family.shape
             if not of_all and (family.kind or family.unknown_words({"foot", "feet"}) or shape[:1] != (feet,)):
                 continue
             inner = shape if of_all else shape[1:]
@@ -431,7 +440,8 @@ class _Proposer:
     def _add_wrench(self, part: str, family: Family) -> None:
         """Forces or moments of contacts, or both where `part` is ""."""
         name = WRENCHES[1] if {"world", "global"} & set(family.words) else WRENCHES[0]
-        entry, known = family.entry, self.out.columns.get(name, {})
+        entry = family.entry
+        known = self.out.columns.get(name, {})
         if part in known or (known and not part) or {"column", "columns"} & set(known):
             return
         if part:
@@ -500,7 +510,8 @@ class _Proposer:
 
     def _is_other_clock(self, family: Family) -> bool:
         """Whether stamps are those of a file, or of arrays, that lack the others."""
-        first, known = family.columns[0], [self.out.columns["time"], *self.out.columns.get("other_times", [])]
+        first = family.columns[0]
+        known = [self.out.columns["time"], *self.out.columns.get("other_times", [])]
         if self.files:
             return not any(entry["column"] in file for file in self.files if first in file for entry in known)
         lengths = [numbers_of(self.sample, [entry["column"]]).size for entry in known]
@@ -538,7 +549,8 @@ class _Proposer:
 
     def _place_unnamed(self) -> None:
         """Columns without names: stamps that increase, then positions and velocities of all joints, by slopes."""
-        count, names = len(self.robot.joints), list(self.foreign)
+        count = len(self.robot.joints)
+        names = list(self.foreign)
         values = numbers_of(self.sample, names)
         stamps = np.array([increases(column) for column in values.T])
         self.families = [
@@ -586,7 +598,8 @@ class _Proposer:
 
     def _settle_units(self) -> None:
         """Degrees, where positions are far beyond a turn, and velocities 57 times their slopes."""
-        family, position = self.family_of.get("joint_position"), self._values("joint_position")
+        family = self.family_of.get("joint_position")
+        position = self._values("joint_position")
         if family is None or position is None:
             return
         entry = self.out.columns["joint_position"]

@@ -183,7 +183,8 @@ def spellings(names: Sequence[str]) -> list[Spelling]:
     """Names as they are, and without a prefix or a suffix that all have, up to a separator; the shortest first."""
     if len(names) < 2:
         return [Spelling({name: name for name in names})]
-    prefixes, suffixes = _common_starts(names), [x[::-1] for x in _common_starts([name[::-1] for name in names])]
+    prefixes = _common_starts(names)
+    suffixes = [x[::-1] for x in _common_starts([name[::-1] for name in names])]
     out = []
     for prefix, suffix in product(prefixes, suffixes):
         stems = {name[len(prefix) : len(name) - len(suffix)]: name for name in names}

@@ -144,7 +144,8 @@ def find_episodes(sample: FileSample) -> FoundEpisodes | None:
         np.nanmedian(np.abs(np.diff(of_joints[name].astype(float), axis=k))) if shape[k] > 1 else np.inf for k in (0, 1)
     ]
     axis = int(steps[1] > steps[0])
-    count, samples = shape[axis], shape[1 - axis]
+    count = shape[axis]
+    samples = shape[1 - axis]
     lengths = next((x for x, y in sample.items() if _LENGTHS.fullmatch(x) and y is not None and y.size == count), "")
     shown = samples if not lengths else int(np.ravel(sample[lengths])[0])  # type: ignore[arg-type]
 
@@ -192,6 +193,7 @@ def read_bag_sample(path: Path, types: Collection[str]) -> dict[str, TopicSample
             with reader_errors_explained("file", MESSAGES_ACCEPTED):
                 topic.messages.append(decoders[name](data))
             if len(topic.messages) > 2 * _MESSAGES:
-                topic.messages, steps[name] = topic.messages[::2], 2 * steps[name]
+                topic.messages = topic.messages[::2]
+                steps[name] = 2 * steps[name]
         topic.count += 1
     return out

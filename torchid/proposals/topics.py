@@ -35,7 +35,8 @@ def propose_topics(sample: Mapping[str, TopicSample], robot: RobotNames) -> MapP
 
 class _Proposer:
     def __init__(self, topics: Mapping[str, TopicSample], robot: RobotNames) -> None:
-        self.topics, self.robot = topics, robot
+        self.topics = topics
+        self.robot = robot
         self.out = MapProposal(key="topics")
         self.used: set[str] = set()
 
@@ -61,7 +62,8 @@ class _Proposer:
 
     def _line(self, name: str) -> str:
         """A topic, its type and what its messages are of, in words."""
-        topic, more = self.topics[name], ""
+        topic = self.topics[name]
+        more = ""
         if topic.type in JOINT_STATES and topic.messages:
             more = f": joints {join_names(list(topic.messages[0].name))}"
         elif frame := frame_of(topic):
@@ -86,7 +88,8 @@ class _Proposer:
 
     def _place_joints(self) -> None:
         """Joint states with most of the robot's joints first, then those of others; the rest is welded."""
-        placed, entries = set[str](), list[tuple[str, dict[str, Any]]]()
+        placed = set[str]()
+        entries = list[tuple[str, dict[str, Any]]]()
         sources = dict[tuple[str, tuple[str, ...]], Any]()
         for name, topic in self._of(JOINT_STATES).items():
             for message in topic.messages[:50]:

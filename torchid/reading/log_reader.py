@@ -119,7 +119,8 @@ class LogReader:
 
     def _read_one(self, path: Path, required: SensorSet | None) -> Samples:
         """The samples of a log, in memory or on the disk."""
-        files, limit_gb = self.setup.config.logs, self.setup.config.preprocessing.memory_gb
+        files = self.setup.config.logs
+        limit_gb = self.setup.config.preprocessing.memory_gb
         size_gb = self._size_gb(path)
         self.excluded.pop(str(path), None)
         if size_gb > limit_gb and split_range(path).joins:
@@ -152,7 +153,8 @@ class LogReader:
 
     def _recorded(self, path: Path) -> Log:
         """A log as it is in its file."""
-        settings, files = self.setup.config.preprocessing, self.setup.config.logs
+        settings = self.setup.config.preprocessing
+        files = self.setup.config.logs
         topics, columns = (None, None) if files is None else (files.topics, files.columns)
         return read_log(
             path,
@@ -167,7 +169,8 @@ class LogReader:
 
     def _in_parts(self, path: Path, required: SensorSet | None) -> Samples:
         """The samples of a log of which a part is in memory at a time."""
-        settings, files = self.setup.config.preprocessing, self.setup.config.logs
+        settings = self.setup.config.preprocessing
+        files = self.setup.config.logs
         columns = None if files is None else files.columns
         with about_file(path), open_log_blocks(path, self.folder, columns, settings.needs_flags) as blocks:
             self._require_known_heading(blocks)
@@ -178,14 +181,16 @@ class LogReader:
 
     def _part(self, blocks: LogBlocks, path: Path, piece: slice, required: SensorSet | None) -> Samples:
         """Some successive samples of a log, by those around that they depend on."""
-        settings, time = self.setup.config.preprocessing, blocks.time
+        settings = self.setup.config.preprocessing
+        time = blocks.time
         beyond = _overlap(time, settings.filter_hz)
         around = slice(max(piece.start - beyond, 0), min(piece.stop + beyond, len(time)))
         name = f"{path} (samples {around.start} to {around.stop - 1} of {len(time)}, counted from there)"
         with about_file(path if around == slice(0, len(time)) else name):
             log = blocks.read(around, settings.exclude_rejected, settings.bridge_gaps_s)
         samples = self.samples_of(log, path, required)
-        stamps, slack = samples.time.numpy(), JITTER * float(np.median(np.diff(log.time)))  # however they round
+        stamps = samples.time.numpy()
+        slack = JITTER * float(np.median(np.diff(log.time)))  # however they round
         inside = stamps >= time[piece.start] - slack
         if piece.stop < len(time):
             inside &= stamps < time[piece.stop] - slack
@@ -210,14 +215,16 @@ class LogReader:
 
     def samples_of(self, recorded: Log, path: Path, required: SensorSet | None) -> Samples:
         """The samples of a log, or of a part of one, that are kept; there may be none."""
-        setup, settings = self.setup, self.setup.config.preprocessing
-        own = setup_of_log(setup, path)
-        acting = with_delayed_torques(without_welded_joints(recorded, own.robot), setup.config.actuators.known_delay)
-        flagged, certain = apply_contact_settings(with_loop_joints(acting, own.robot), own)
-        checked, clean = None, flagged
+        setup = self.setup
+        settings = self.setup.config.preprocessing
+        loaded = setup_of_log(setup, path)
+        acting = with_delayed_torques(without_welded_joints(recorded, loaded.robot), setup.config.actuators.known_delay)
+        flagged, certain = apply_contact_settings(with_loop_joints(acting, loaded.robot), loaded)
+        checked = None
+        clean = flagged
         if settings.exclude_rejected:
             declared = replace(setup.declared, delay=0.0)  # the log has been read with it
-            checked = check(flagged, own.robot, setup.contacts, settings.filter_hz, settings.derived, declared)
+            checked = check(flagged, loaded.robot, setup.contacts, settings.filter_hz, settings.derived, declared)
             clean = checked.repaired
         else:
             warn_of_steps(flagged)
@@ -251,10 +258,13 @@ class LogReader:
         Returns:
             All samples, the last segment of the log that they are bound from, and whether samples depend on others.
         """
-        setup, settings = self.setup, self.setup.config.preprocessing
+        setup = self.setup
+        settings = self.setup.config.preprocessing
         if setup.contacts and log.contact_active is not None and fits_contact_offsets(setup):
             log = replace(log, contact_unloaded=unloaded_readings(log, find_unloaded(log.time, log.contact_active)))
-        standing, longest, stated = None, log, setup.config.sensors.noise.motion
+        standing = None
+        longest = log
+        stated = setup.config.sensors.noise.motion
         if settings.base_motion is not None:
             standing = base_pose_from_feet(log, setup.robot, setup.contacts)
             log = standing.log
@@ -269,7 +279,8 @@ class LogReader:
         segments = [(log, whole)]
         if standing is not None and whole is not None:
             segments = self._segments(standing, whole)
-        samples, bandwidths = list[Samples](), list[float]()
+        samples = list[Samples]()
+        bandwidths = list[float]()
         for segment, timeline in segments:
             moved = segment
             if timeline is not None:
@@ -288,7 +299,8 @@ class LogReader:
 
     def _timeline(self, time: FloatArray, differentiates: bool) -> Timeline | None:
         """Stamps of a log and of what becomes of it; None where nothing has to be done."""
-        setup, settings = self.setup, self.setup.config.preprocessing
+        setup = self.setup
+        settings = self.setup.config.preprocessing
         friction = setup.terms.sign_width, setup.terms.stribeck, setup.config.actuators.known["stiction"]
         return make_timeline(time, differentiates, settings.filter_hz, settings.sample_rate_hz, *friction)
 
@@ -348,8 +360,9 @@ def _with_flags(log: Log, setup: RobotSetup) -> tuple[Log, BoolArray]:
     """A log with contact flags as recorded, from joint torques or from forces, and where they are certain."""
     settings = setup.config.preprocessing
     if settings.detect_contacts is not None:
-        rest = settings.detect_contacts, settings.takes_possible_contacts, setup.terms.sign_width
-        return with_detected_contacts(log, setup.robot, setup.contacts, *rest)
+        possible = settings.takes_possible_contacts
+        width = setup.terms.sign_width
+        return with_detected_contacts(log, setup.robot, setup.contacts, settings.detect_contacts, possible, width)
     if settings.contact_threshold is not None:
         return with_flags_by_force(log, settings.contact_threshold)
     return log, np.ones(len(log), dtype=bool)
@@ -376,9 +389,10 @@ def check_read(logs: Mapping[str, Sequence[Samples]]) -> None:
     parts = {key: [split_range(log.source) for log in of_key] for key, of_key in logs.items()}
     spans = {split_range(log.source): log.time[[0, -1]].tolist() for of_key in logs.values() for log in of_key}
 
-    def share(one: LogPart, other: LogPart) -> bool:
-        (start, stop), (of_other, until) = spans[one], spans[other]
-        return one.shares_samples(other) is None and start <= until and of_other <= stop
+    def share(part: LogPart, other: LogPart) -> bool:
+        (start, stop) = spans[part]
+        (of_other, until) = spans[other]
+        return part.shares_samples(other) is None and start <= until and of_other <= stop
 
     require_apart(parts, share)
 
