@@ -11,7 +11,7 @@ from legged.robots import FRICTION_WIDTH, QUADRUPED, TrueRobot
 from legged.simulate import simulated
 from motions import value
 
-from torchid.logs.preprocess import away_from_changes
+from torchid.logs.preprocess import near_contact_changes
 from torchid.parameters import COULOMB, PER_BODY
 from torchid.problem import LinearProblem
 from torchid.problem.contact_detection import fitted_parameters, most_probable, prepare
@@ -48,7 +48,7 @@ def test_the_mass_of_a_walker_follows_from_its_torques_and_the_contacts_that_sta
     found = prepare(exact.log, true.robot, contacts, np.inf)
     at = np.searchsorted(exact.log.time, found.log.time - 1e-9)
     samples = replace(found.samples, active=torch.from_numpy(value(exact.log.contact_active)[at]))
-    away = value(away_from_changes(exact.log, found.log.time, 0.05))
+    away = ~near_contact_changes(exact.log, found.log.time, 0.05)
     sensors = named_sensors("joints", true.robot.n, len(contacts))
     builder = RowBuilder(true.robot, contacts, sensors, ExtraTerms(armature=True, sign_width=FRICTION_WIDTH))
     phi, armature = fitted_parameters(samples[torch.from_numpy(np.flatnonzero(away))], builder, true.robot)

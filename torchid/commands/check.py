@@ -25,7 +25,7 @@ from torchid.logs.blocks import has_blocks, open_log_blocks
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind, new_log_kind
 from torchid.logs.read import files_of_recordings_kept
 from torchid.logs.time_range import log_title, split_range
-from torchid.reading.log_reader import apply_contact_settings, memory_needed, setup_of_log
+from torchid.reading.log_reader import apply_contact_settings, memory_needed, recorded_log, setup_of_log
 from torchid.report.figure_style import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars
@@ -115,7 +115,8 @@ def check_experiment(
     with progress_bars() as bars, files_of_recordings_kept():
         for file in bars.track(files, description="checking"):
             settings, own = config.preprocessing, setup_of_log(setup, file)
-            log, _ = apply_contact_settings(_read_log_to_check(file, config.logs, settings), own)
+            _require_memory(file, settings)
+            log, _ = apply_contact_settings(recorded_log(file, config.logs, settings), own)
             rest = setup.contacts, settings.filter_hz, settings.derived, setup.declared, required
             found = check(log, own.robot, *rest)
             checked.append(replace(found, rolling=setup.rolling))
@@ -160,21 +161,11 @@ def check_log(
     return replace(check(log, robot, contacts), rolling=rolling)
 
 
-def _read_log_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:
-    """One of the logs of an experiment as it was read.
-
-    Raises:
-        LogError: it cannot be read, or is larger than what may be in memory at once.
-    """
-    _require_memory(path, settings)
-    return _read_with_gaps(path, logs, settings)
-
-
 def segments_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[LogSegment]:
     """One of the logs of an experiment in equal segments of at most `MOST_CHECKED` samples, the middle first.
 
     Raises:
-        LogError: as `_read_log_to_check`.
+        LogError: it cannot be read, or is larger than what may be in memory at once.
     """
     _require_memory(path, settings)
     yield from recorded_segments(path, logs, settings)
@@ -186,7 +177,7 @@ def recorded_segments(
     """As `segments_to_check`, of a log of any size."""
     is_whole = settings.bridge_gaps_s is not None or not has_blocks(path, logs.columns)
     if is_whole or existing_log_kind(path) is LogKind.TABLE:
-        log = _read_with_gaps(path, logs, settings)
+        log = recorded_log(path, logs, settings)
         for segment in _segments(len(log)):
             yield LogSegment(log.select(segment), _segment_name(path, segment, len(log)), len(log))
         return
@@ -195,18 +186,6 @@ def recorded_segments(
             with about_file(path):
                 log = blocks.read(segment, allow_gaps)
             yield LogSegment(log, _segment_name(path, segment, len(blocks)), len(blocks))
-
-
-def _read_with_gaps(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:
-    """A log with those of its gaps that are too long to be bridged."""
-    return read_log(
-        path,
-        logs.topics,
-        allow_gaps=True,
-        columns=logs.columns,
-        bridge_gaps_s=settings.bridge_gaps_s,
-        needs_flags=settings.needs_flags,
-    )
 
 
 def _segments(samples: int) -> list[slice]:

@@ -46,6 +46,7 @@ from torchid.logs.log import (
 )
 from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.schema import column_pattern, columns_of_file
+from torchid.logs.segments import unbroken_segments
 from torchid.logs.tables import table_names
 from torchid.logs.time_range import LogFile
 from torchid.logs.timeline import JITTER, LONGEST_STEP, spline_derivatives
@@ -99,19 +100,17 @@ class Series:
 
     def _unbroken(self, time: FloatArray) -> slice:
         """The samples around the log's time, checked for gaps that are too long to be interpolated."""
-        steps = np.diff(self.stamps)
-        long = np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) if len(steps) else steps.astype(np.intp)
-        inside = long[(self.stamps[long + 1] > time[0]) & (self.stamps[long] < time[-1])]
-        if len(inside):
-            found = (
-                f"a gap of {steps[inside[0]]:.4g} s from {self.stamps[inside[0]]:.4g} s on, "
-                f"where the median step is {np.median(steps):.4g} s"
-            )
+        segments = list(unbroken_segments(self.stamps))
+        starts = self.stamps[[segment.start for segment in segments]]
+        number = max(int(np.searchsorted(starts, time[0], side="right")) - 1, 0)
+        run = segments[number]
+        if number + 1 < len(segments) and self.stamps[run.stop - 1] < time[-1]:
+            before, after = self.stamps[[run.stop - 1, run.stop]]
+            found = f"a gap of {after - before:.4g} s from {before:.4g} s on, "
+            found += f"where the median step is {np.median(np.diff(self.stamps)):.4g} s"
             accepted = f"steps of at most {LONGEST_STEP:g} median steps: cut the {self.whole} there"
             raise LogError.at_field(self.name or "time", found, accepted)
-        before, after = np.searchsorted(self.stamps[long], time[[0, -1]])
-        start = int(long[before - 1]) + 1 if before else 0
-        return slice(start, int(long[after]) + 1 if after < len(long) else len(self.stamps))
+        return run
 
     def _interpolated(self, time: FloatArray, run: slice, name: str) -> FloatArray:
         values = self.fields[name][run]

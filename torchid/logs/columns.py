@@ -346,10 +346,6 @@ class Columns:
         """Fields of a log that have an entry."""
         return tuple(name for name, entry in vars(self).items() if isinstance(entry, ColumnEntry))
 
-    def order_of(self, entry: ColumnEntry, kind: str) -> list[str | None] | None:
-        """Names by number, of an entry for a kind of names (`joint`, ...)."""
-        return entry.order or getattr(self, f"{kind}_order")
-
     def name_of(self, kind: str) -> str:
         """The pattern of the URDF's names of a kind."""
         return str(getattr(self, f"{kind}_name", f"{{{kind}}}"))

@@ -154,7 +154,8 @@ def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Covera
 
 def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> dict[str, Any]:
     """Fields that change in the preprocessed log."""
-    fields: dict[str, Any] = {"time": timeline.stamps_of(log.time)}
+    stamps = log.time[timeline.kept] if timeline.keeps_stamps else timeline.origin + timeline.output_stamps
+    fields: dict[str, Any] = {"time": stamps}
     fields |= _motion(log, timeline)
     for name in NAN_ALLOWED:
         if getattr(log, name) is not None:
@@ -291,11 +292,6 @@ def near_contact_changes(log: Log, time: FloatArray, margin: float) -> BoolArray
     for start, stop in zip(first, last, strict=True):
         near[start:stop] = True
     return near
-
-
-def away_from_changes(log: Log, time: FloatArray, margin: float) -> BoolArray:
-    """Which of some stamps are not `near_contact_changes`."""
-    return ~near_contact_changes(log, time, margin)
 
 
 def find_unloaded(time: FloatArray, active: BoolArray, margin: float = UNLOADED_MARGIN_S) -> BoolArray:

@@ -143,7 +143,7 @@ class _Search:
             return Matched(part, (), tuple(_fill(text, {}, k) for k in numbers), False, bool(part.components))
         if not part.kind:
             return Matched(part, (), _spell(part, text, 0, ""), False, _splits(part, text))
-        order = None if part.is_native else self._columns.order_of(entry, part.kind)
+        order = None if part.is_native else entry.order or getattr(self._columns, f"{part.kind}_order")
         if order is None and part.kind in holders:
             return None
         if order is None:

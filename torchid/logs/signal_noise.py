@@ -100,15 +100,19 @@ def white_noise(time: FloatArray, values: FloatArray) -> FloatArray:
     Differences of a high order leave of smooth motion less and less, of white noise always the same. Those across gaps
     (NaN) are left out; too few of them show nothing.
     """
-    if not np.isfinite(values).all():
-        return np.array([_beside_gaps(time, channel) for channel in values.T])
-    lower, higher = (_left_by_differences(_evenly(time, values), order) for order in _ORDERS)
-    return _if_white(lower, higher, np.abs(values).max(axis=0))
+    return np.array([_white_noise(time, channel) for channel in values.T])
 
 
-def _if_white(lower: FloatArray, higher: FloatArray, largest: FloatArray) -> FloatArray:
-    """What differences of the lower order leave, 0 where those of the higher leave less, or no more than rounding."""
-    return np.where((higher > _WHITE * lower) & (higher > _LEAST * largest), lower, 0.0)
+def _white_noise(time: FloatArray, channel: FloatArray) -> float:
+    """As `white_noise` of a channel (N,), between its gaps."""
+    edges = np.flatnonzero(np.diff(np.isfinite(channel), prepend=False, append=False))
+    runs = [slice(start, stop) for start, stop in edges.reshape(-1, 2) if stop - start > max(_ORDERS)]
+    if sum(run.stop - run.start for run in runs) < _FEWEST:
+        return 0.0
+    parts = [_evenly(time[run], channel[run, None]) for run in runs]
+    lower, higher = (_without_outliers(np.concatenate([_differences(x, order) for x in parts])) for order in _ORDERS)
+    is_white = higher > _WHITE * lower and higher > _LEAST * np.nanmax(np.abs(channel))
+    return lower if is_white else 0.0
 
 
 def _evenly(time: FloatArray, values: FloatArray) -> FloatArray:
@@ -119,24 +123,9 @@ def _evenly(time: FloatArray, values: FloatArray) -> FloatArray:
     return spline_derivatives(time, values, np.linspace(time[0], time[-1], len(time)), (0,))[0]
 
 
-def _beside_gaps(time: FloatArray, channel: FloatArray) -> float:
-    """What `white_noise` finds of a channel (N,) with gaps, between them."""
-    edges = np.flatnonzero(np.diff(np.isfinite(channel), prepend=False, append=False))
-    runs = [slice(start, stop) for start, stop in edges.reshape(-1, 2) if stop - start > max(_ORDERS)]
-    if sum(run.stop - run.start for run in runs) < _FEWEST:
-        return 0.0
-    parts = [_evenly(time[run], channel[run, None]) for run in runs]
-    lower, higher = (_left(np.concatenate([_differences(x, order) for x in parts])) for order in _ORDERS)
-    return float(_if_white(lower, higher, np.nanmax(np.abs(channel), keepdims=True))[0])
-
-
 def rough_noise(values: FloatArray) -> FloatArray:
     """Standard deviation of whatever is not smooth from sample to sample in even channels (N, c), (c,)."""
     return np.asarray(_differences(values, _ORDERS[0]).std(axis=0))
-
-
-def _left_by_differences(values: FloatArray, order: int) -> FloatArray:
-    return _left(_differences(values, order))
 
 
 def _differences(values: FloatArray, order: int) -> FloatArray:
@@ -144,10 +133,10 @@ def _differences(values: FloatArray, order: int) -> FloatArray:
     return np.asarray(np.diff(values, n=order, axis=0) / np.sqrt(comb(2 * order, order)))
 
 
-def _left(differences: FloatArray) -> FloatArray:
-    """Standard deviation of differences of channels, without the few that are large."""
-    off = np.abs(differences - np.median(differences, axis=0))
-    return np.asarray(np.minimum(np.median(off, axis=0) / MAD_PER_STD, differences.std(axis=0)))
+def _without_outliers(differences: FloatArray) -> float:
+    """Standard deviation of differences of a channel, without the few that are large."""
+    off = np.abs(differences - np.median(differences))
+    return float(np.minimum(np.median(off) / MAD_PER_STD, differences.std()))
 
 
 def noise_of_derivatives(step: float, timeline: Timeline) -> FloatArray:
@@ -204,7 +193,10 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline,
     if cutoff is None:
         advice = "a low-pass filter, preprocessing.cutoff_hz"
     else:
-        lower = cutoff * float(np.median([_slower(share, order) for _, share, order in noisy]))  # some hardly move
+        shares = np.array([share for _, share, _ in noisy])
+        powers = np.array([2 * order + 1 for *_, order in noisy])  # of the cutoff, with which the noise goes
+        ratios = _LITTLE / (1.0 - _LITTLE) * np.maximum(1.0 - shares, 1e-3) / shares
+        lower = cutoff * float(np.median(ratios ** (1.0 / powers)))  # as channels may hardly move
         advice = f"a cutoff of {lower:.2g} Hz, if the motion is that slow, or faster motion"
     warn_about_file(f"{found}; what rests on them is uncertain; accepted: {advice}")
 
@@ -215,12 +207,6 @@ def _stands_still(log: Log, noise: SignalNoise) -> bool:
     if std is None or log.joint_position is None or not log.joint_names:
         return False
     return bool((np.nanstd(log.joint_position, axis=0) < _STILL * std).all())
-
-
-def _slower(share: float, order: int) -> float:
-    """Factor of the cutoff that leaves little noise: its power goes with the cutoff to the power 2 order + 1."""
-    ratio = _LITTLE / (1.0 - _LITTLE) * max(1.0 - share, 1e-3) / share
-    return float(ratio ** (1.0 / (2 * order + 1)))
 
 
 def _noise_shares(log: Log, preprocessed: Log, noise: SignalNoise) -> Iterator[tuple[str, float, int]]:

@@ -235,7 +235,7 @@ class _Served:
         self._header = read_header(path) if is_text_table(path) else None
         self._lengths = dict[str, int]()  # numbers in each row of columns of lists
         self._origin = dict[str, str]()  # of a column of numbers, the column of lists
-        self._first = self._flat(self._read_first())
+        self._first = self._flat(next(self._tables()))
         check_column_names(self._names())
 
     def _names(self) -> list[str]:
@@ -277,6 +277,8 @@ class _Served:
         self._columns = len(sources)
         rows = 0
         for table in self._tables(sources, texts):
+            if not table.num_rows:
+                continue
             rows += table.num_rows
             self._check_size(rows, whole)
             flat = self._flat(table)
@@ -287,8 +289,7 @@ class _Served:
                     raise LogError(self._path, f"column '{name}'", f"values of type {flat[name].type}", accepted)
                 if name == TEXT_FIELD and values.dtype.kind != "U":
                     raise LogError(self._path, f"column '{name}'", f"values of type {flat[name].type}", "text")
-            if flat.num_rows:
-                yield {name: values for name, values in block.items() if values is not None}
+            yield {name: values for name, values in block.items() if values is not None}
 
     def _check_size(self, rows: int, whole: bool) -> None:
         """Raise LogError for more numbers than are read whole, or than a file of that size has."""
@@ -299,36 +300,32 @@ class _Served:
 
     # ------------------------------------------------------------------------------------------- rows as Arrow's tables
 
-    def _read_first(self) -> Any:
-        """The first rows, with the types that Arrow infers."""
+    def _tables(self, sources: Sequence[str] | None = None, texts: Sequence[str] = ()) -> Iterator[Any]:
+        """Rows of some columns; without these all, with the types that Arrow infers, of which only the first count."""
         if self._header is not None:
-            columns = self._header.names
+            names = self._header.names if sources is None else sources
+            types = {name: self._csv_type(name, name in texts) for name in sources or ()}
             if not self._header.has_rows:
-                return self._pa.table({name: self._pa.nulls(0) for name in columns})
-            return self._pa.Table.from_batches([next(iter(self._csv_batches(self._header, {}, columns)))])
-        if self._path.suffix.lower() in JSON_LINES:
-            return self._json_table().slice(0, _SAMPLE_ROWS)
-        with self._parquet() as file:
-            check_column_names([field.name for field in file.schema_arrow])
-            self._columns = file.metadata.num_columns
-            self._check_size(file.metadata.num_rows, whole=False)
-            batch = next(file.iter_batches(_SAMPLE_ROWS), None)
-            return file.schema_arrow.empty_table() if batch is None else self._pa.Table.from_batches([batch])
-
-    def _tables(self, sources: Sequence[str], texts: Sequence[str]) -> Iterator[Any]:
-        if self._header is not None:
-            if self._header.has_rows:
-                types = {name: self._csv_type(name, name in texts) for name in sources}
-                yield from (
-                    self._pa.Table.from_batches([batch]) for batch in self._csv_batches(self._header, types, sources)
-                )
+                yield self._pa.table({name: self._pa.nulls(0) for name in names})
+                return
+            yield from map(self._table_of_batch, self._csv_batches(self._header, types, names))
         elif self._path.suffix.lower() in JSON_LINES:
-            yield self._json_table()
+            table = self._json_table()
+            yield table.slice(0, _SAMPLE_ROWS) if sources is None else table
         else:
             with self._parquet() as file:
-                of_file = list(dict.fromkeys(self._origin.get(name, name) for name in sources))
-                for batch in file.iter_batches(_BATCH_ROWS, columns=of_file):
-                    yield self._pa.Table.from_batches([batch])
+                if sources is None:
+                    check_column_names([field.name for field in file.schema_arrow])
+                    self._columns = file.metadata.num_columns
+                    self._check_size(file.metadata.num_rows, whole=False)
+                if not file.metadata.num_rows:
+                    yield file.schema_arrow.empty_table()
+                columns = None if sources is None else list(dict.fromkeys(self._origin.get(x, x) for x in sources))
+                rows = _SAMPLE_ROWS if sources is None else _BATCH_ROWS
+                yield from map(self._table_of_batch, file.iter_batches(rows, columns=columns))
+
+    def _table_of_batch(self, batch: Any) -> Any:
+        return self._pa.Table.from_batches([batch])
 
     def _csv_type(self, name: str, is_text: bool) -> Any:
         """That of a column: the inferred one of dates, truth values and allowed texts, else numbers."""

@@ -123,10 +123,6 @@ class Timeline:
         """Stamps (K,) of the preprocessed log, counted from the log's first sample."""
         return self.grid[self.kept] if self.output is None else self.output
 
-    def stamps_of(self, time: FloatArray) -> FloatArray:
-        """Stamps (K,) [s] of the preprocessed log, of one with stamps (N,) [s]."""
-        return time[self.kept] if self.keeps_stamps else self.origin + self.output_stamps
-
     @property
     def cutoff_hz(self) -> float | None:
         """Cutoff of the filter [Hz], None without one."""

@@ -113,12 +113,9 @@ def require_joints_of(field: str, robot: str, joints: Collection[str]) -> None:
     absent = [name for name in JOINT_ORDERS[robot].names if name not in joints]
     if absent:
         found = f"'{robot}', whose joint '{absent[0]}' the robot has not"
-        raise ConfigError.at_field(field, found, _nearest_orders(joints))
-
-
-def _nearest_orders(joints: Collection[str]) -> str:
-    """The robots whose joints a URDF has, in words."""
-    return ", ".join(suitable_orders(joints)) or "names of joints by number, as no robot known by name has these"
+        accepted = ", ".join(suitable_orders(joints))
+        accepted = accepted or "names of joints by number, as no robot known by name has these"
+        raise ConfigError.at_field(field, found, accepted)
 
 
 def robot_with_order(order: Collection[str | None] | None) -> str:

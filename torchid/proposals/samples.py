@@ -131,18 +131,15 @@ def find_episodes(sample: FileSample) -> FoundEpisodes | None:
         if any(propose_field(inner).startswith("joint_") for inner in first):
             others = {name: x for name, x in sample.items() if not in_groups(pattern).fullmatch(name)}
             return FoundEpisodes({"groups": pattern}, others | first, "a recording in each group")
-    of_joints = {
-        name: x
-        for name, x in sample.items()
-        if x is not None and x.ndim == 3 and propose_field(name).startswith("joint_")
-    }
-    name = next((x for x in of_joints if propose_field(x) == "joint_position"), next(iter(of_joints), ""))
-    if not name or any(x is not None and x.ndim == 2 and len(x) == len(of_joints[name]) for x in _of_joints(sample)):
+    joints = {name: x for name, x in sample.items() if x is not None and propose_field(name).startswith("joint_")}
+    stacked = sorted(
+        (name for name in joints if joints[name].ndim == 3), key=lambda x: propose_field(x) != "joint_position"
+    )
+    if not stacked or any(x.ndim == 2 and len(x) == len(joints[stacked[0]]) for x in joints.values()):
         return None
-    shape = of_joints[name].shape[:2]
-    steps = [
-        np.nanmedian(np.abs(np.diff(of_joints[name].astype(float), axis=k))) if shape[k] > 1 else np.inf for k in (0, 1)
-    ]
+    array = joints[stacked[0]].astype(float)
+    shape = array.shape[:2]
+    steps = [np.nanmedian(np.abs(np.diff(array, axis=k))) if shape[k] > 1 else np.inf for k in (0, 1)]
     axis = int(steps[1] > steps[0])
     count = shape[axis]
     samples = shape[1 - axis]
@@ -159,10 +156,6 @@ def find_episodes(sample: FileSample) -> FoundEpisodes | None:
     entry = {"axis": axis} | ({"lengths": lengths} if lengths else {})
     axes = "(episodes, samples, ...)" if axis == 0 else "(samples, episodes, ...)"
     return FoundEpisodes(entry, taken, f"{count} recordings side by side, arrays {axes}, as samples change little")
-
-
-def _of_joints(sample: FileSample) -> list[NDArray[Any] | None]:
-    return [x for name, x in sample.items() if propose_field(name).startswith("joint_")]
 
 
 # --------------------------------------------------------------------------------------------------------- topics

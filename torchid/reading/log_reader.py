@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchid import distributed
-from torchid.config.logs import require_apart
+from torchid.config.logs import LogsConfig, PreprocessingConfig, require_apart
 from torchid.errors import ConfigError, LogError, about_file
 from torchid.fitting.experiment import RobotSetup, S
 from torchid.log_checks import drop_rejected
@@ -34,13 +34,13 @@ from torchid.logs.gaps import Coverage
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.low_pass import LowPass
 from torchid.logs.preprocess import (
-    away_from_changes,
     away_from_stamps,
     find_unloaded,
     lacks_derivatives,
     make_timeline,
     measured_coverage,
     move_to_timeline,
+    near_contact_changes,
     unloaded_readings,
 )
 from torchid.logs.read import files_of_recordings_kept
@@ -154,16 +154,7 @@ class LogReader:
     def _recorded(self, path: Path) -> Log:
         """A log as it is in its file."""
         settings = self.setup.config.preprocessing
-        files = self.setup.config.logs
-        topics, columns = (None, None) if files is None else (files.topics, files.columns)
-        return read_log(
-            path,
-            topics,
-            allow_gaps=settings.exclude_rejected,
-            columns=columns,
-            bridge_gaps_s=settings.bridge_gaps_s,
-            needs_flags=settings.needs_flags,
-        )
+        return recorded_log(path, self.setup.config.logs, settings, allow_gaps=settings.exclude_rejected)
 
     # ------------------------------------------------------------------------------------------------- logs in parts
 
@@ -239,7 +230,7 @@ class LogReader:
             warn_of_slip(slip, recorded.source)
             kept &= ~slip.slips.any(axis=1)
         if settings.margin_s is not None and settings.detect_contacts is None:
-            kept &= away_from_changes(flagged, time, settings.margin_s)
+            kept &= ~near_contact_changes(flagged, time, settings.margin_s)
         if not certain.all():
             kept &= away_from_stamps(time, flagged.time[~certain], settings.margin_s or 0.0)
         if checked is not None:
@@ -400,6 +391,18 @@ def check_read(logs: Mapping[str, Sequence[Samples]]) -> None:
 def fits_contact_offsets(setup: RobotSetup) -> bool:
     """Whether offsets of contact sensors are fitted, the only use of their readings in the air."""
     return any(channel.startswith("contact") for channel in setup.terms.offsets)
+
+
+def recorded_log(path: Path, files: LogsConfig | None, settings: PreprocessingConfig, allow_gaps: bool = True) -> Log:
+    """A log as it is in its file, by an experiment's maps; `allow_gaps`: with those that are too long to be bridged."""
+    return read_log(
+        path,
+        None if files is None else files.topics,
+        allow_gaps=allow_gaps,
+        columns=None if files is None else files.columns,
+        bridge_gaps_s=settings.bridge_gaps_s,
+        needs_flags=settings.needs_flags,
+    )
 
 
 def memory_needed(path: Path, memory_gb: float, held: float = 0.0) -> float:
