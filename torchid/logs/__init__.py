@@ -1,11 +1,11 @@
 """Logs: read and write the file format, filter, differentiate and resample.
 
-- the format: `log` (fields, shapes), `read`, `containers`, `arrays`, `lazy_arrays`, `time_range`, `episodes`
-- files of arrays: `hdf5`, `matlab`, `json_files`; of tables: `tables`, `table_files`
+- the format: `log` (fields, shapes), `read`, `containers`, `arrays`, `time_range`, `episodes`
+- files of arrays: `array_files`; of tables: `tables`, `table_files`
 - bags: `bags`, `bag_files`, `ros_topics`, `unitree`; series with stamps of their own: `alignment`
 - maps of columns and arrays to fields: `columns`, `schema`, `units`
 - preprocessing: `preprocess`, `timeline`, `low_pass`, `cutoff`, `segments`, `gaps`, `quaternion`, `flags`,
-  `dry_friction`, `signal_noise`; of large logs `blocks`
+  `dry_friction`, `signal_noise`; of large logs `blocks`, `spill`
 """
 
 from typing import TYPE_CHECKING
