@@ -11,13 +11,17 @@ import pytest
 from demo import shortened_demo
 from refusals import refusal
 from repository import DEMO
+from synthetic import SOLO12
 
 from torchid.cli import main
 from torchid.commands.folder import REPLAY, read_manifest
-from torchid.commands.replay import PARAMETER_SAMPLES, Replay, _feet, replay
+from torchid.commands.replay import PARAMETER_SAMPLES, Replay, _feet, _model, replay
+from torchid.config.experiment import ActuatorsConfig
 from torchid.errors import ConfigError
 from torchid.fitting.fit import Comparison
+from torchid.problem.extras import ACTUATORS, ExtraTerms
 from torchid.report.figures import drift_figure
+from torchid.robot import load_robot
 from torchid.sensing import Contact
 from torchid.simulation.replay import Drift
 from torchid.terminal.simulations import replay_lines
@@ -169,3 +173,17 @@ def test_a_flat_contact_without_spheres_is_refused_with_what_a_replay_can_stand_
     urdf = DEMO / "quadruped.urdf"
     with pytest.raises(ConfigError, match=r"contacts: trunk: flat, .*quadruped\.urdf.* point contacts"):
         _feet([Contact("trunk", "flat")], urdf)
+
+
+def test_every_term_of_actuators_has_its_fields_and_is_simulated() -> None:
+    """A new row of `ACTUATORS` needs these; all else follows from the row."""
+    robot = load_robot(SOLO12)
+    plain = _model(robot.path, robot, {}, None)
+    for name in ACTUATORS:
+        assert name in ExtraTerms.__dataclass_fields__
+        assert name in ActuatorsConfig.__dataclass_fields__
+        fitted = _model(robot.path, robot, {name: {robot.joint_names[0]: 0.7}}, None, stribeck=0.1)
+        changed = [
+            x for x in ("armature", "offset", "stiffness", "stribeck") if getattr(fitted, x)[0] != getattr(plain, x)[0]
+        ]
+        assert len(changed) == 1, name

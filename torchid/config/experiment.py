@@ -126,9 +126,8 @@ class ActuatorsConfig:
     @staticmethod
     def without_terms() -> dict[str, Any]:
         """What each key is without its term."""
-        return dict.fromkeys(("stribeck", "sign_width", "delay")) | dict.fromkeys(
-            ("armature", "torque_offset", "asymmetric_coulomb", "stiffness", "stiction"), False
-        )
+        fields = dataclasses.fields(ActuatorsConfig)
+        return {field.name: False if field.type == "BoolOrAuto" else None for field in fields}
 
 
 @dataclass(config=STRICT, frozen=True)

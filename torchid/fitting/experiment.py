@@ -150,9 +150,9 @@ def check_terms(
             if not _fitting(measured[kind], pattern):
                 what = f"whose {kind} is not measured"
                 raise UnknownNameError.at_field(f"sensors.scales.{kind}", pattern, measured[kind], what)
+    by_default = vars(type(actuators)())
     for name, value in vars(actuators).items():
-        unset = value == AUTO and name != "stribeck"  # what logs choose by default
-        if value and not unset and "joint_torque" not in measured:
+        if value and value != by_default[name] and "joint_torque" not in measured:
             accepted = "joint torques among the sensors, or no such key"
             raise ConfigError.at_field(f"actuators.{name}", "set, but no joint torque is measured", accepted)
 

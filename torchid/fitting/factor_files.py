@@ -622,7 +622,7 @@ def with_choices_of(model: RowModel, experiment: Experiment) -> Experiment:
     config = experiment.config
     labels = settings.get("actuators")
     kinds = {label.partition(" of ")[0] for label in labels} if isinstance(labels, list) else set[str]()
-    found: dict[str, Any] = {name: in_words(name) in kinds for name in ACTUATORS if name != "stribeck"}
+    found: dict[str, Any] = {name: in_words(name) in kinds for name in ACTUATORS}
     found |= {name: settings.get(f"actuators.{name}") for name in ("sign_width", "delay", "stiction", "stribeck")}
     known = config.actuators.known
     chosen = {name: x or known[name] for name, x in found.items() if vars(config.actuators)[name] == AUTO}

@@ -24,7 +24,6 @@ from torchid.identifiability.confounding import mass_weights
 from torchid.logs.containers import open_container
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import Samples
-from torchid.problem.elimination import NEVER_NEGATIVE
 from torchid.problem.extras import ACTUATORS, in_words
 from torchid.regressor import Regressor
 from torchid.reprs import short_repr
@@ -113,7 +112,7 @@ def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPo
             free=problem.free,
             conditions=conditions,
             extra_size=np.array([max(extra.size, abs(found.get(extra.label, 0.0))) for extra in extras]),
-            extra_lower=np.array([0.0 if extra.what in NEVER_NEGATIVE else -np.inf for extra in extras]),
+            extra_lower=np.array([0.0 if extra.nonnegative else -np.inf for extra in extras]),
         ),
         body_names=tuple(robot.body_names),
         joint_names=tuple("" if joint is None else joint.name for joint in joints),

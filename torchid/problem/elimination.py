@@ -25,8 +25,6 @@ from torchid.problem.rows import RowBuilder
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, column_scale, is_significant
 
-NEVER_NEGATIVE = ("armature", "stiffness", "stribeck")
-"""Extra parameters that are at least 0: friction at rest is no less than Coulomb friction."""
 _DIRECTIONS = {"forwards": 1.0, "backwards": -1.0}
 
 
@@ -250,13 +248,13 @@ def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
 def _bounded_terms(of_all: Elimination, robot: Robot) -> EliminatedTerms | None:
     """The unknowns of all logs, with the rows they have been eliminated by; None if no condition is on any.
 
-    None of `NEVER_NEGATIVE` is, nor is dry friction in either direction where the two differ.
+    No term that is `nonnegative` is, nor is dry friction in either direction where the two differ.
     """
     conditions: list[SignCondition] = []
     extras = of_all.extras
     for number, extra in enumerate(extras):
         unit = np.eye(len(extras))[number]
-        if extra.what in NEVER_NEGATIVE:
+        if extra.nonnegative:
             conditions.append(SignCondition(extra.label, unit, np.zeros(robot.nominal.size), extra.size, extra.unit))
         if extra.what == "asymmetric_coulomb" and extra.dof is not None:
             friction = _dry_friction(robot, extra.dof)

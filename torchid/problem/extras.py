@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -21,15 +21,6 @@ from torchid.sensing.sensors import measured_components, recorded_components
 
 CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment")
 """Kinds of sensor channels, as `SensorNoise` has them."""
-
-ACTUATORS = {
-    "armature": ("kg m^2", 0.1),
-    "torque_offset": ("N m", 5.0),
-    "asymmetric_coulomb": ("N m", 1.0),
-    "stribeck": ("N m", 1.0),
-    "stiffness": ("N m/rad", 1.0),
-}
-"""Extra parameters of joints rather than sensors: their unit, and the size of a plausible value in it."""
 
 SLOPE = "slope"
 """Kind of the further unknown of a search, which no fit has: how far a setting is off, such as a delay, to first order.
@@ -76,8 +67,48 @@ class ExtraTerms:
     __repr__ = short_repr
 
 
-_OF_MOTORS = ("torque_offset",)
-"""Those of `ACTUATORS` that joints without a motor have not."""
+@dataclass(frozen=True)
+class ActuatorTerm:
+    """An extra parameter of every joint whose torque is measured: it adds value times column to the torque.
+
+    Attributes:
+        unit: of the parameter at a hinge.
+        size: of a plausible value, in this unit.
+        words: what labels call it.
+        column: (B,) of samples, at a joint's index.
+        nonnegative: whether physics keeps it from being negative.
+        needs_motor: whether joints without a motor have none.
+    """
+
+    unit: str
+    size: float
+    words: str
+    column: Callable[[Samples, KinematicTree, int], Tensor]
+    nonnegative: bool = False
+    needs_motor: bool = False
+
+
+def _asymmetry_column(samples: Samples, tree: KinematicTree, dof: int) -> Tensor:
+    return tree.coulomb_sign(samples.joint_velocity[:, dof]).abs()
+
+
+def _stribeck_column(samples: Samples, tree: KinematicTree, dof: int) -> Tensor:
+    filtered = samples.stribeck
+    return tree.stribeck_share(samples.joint_velocity[:, dof]) if filtered is None else filtered[:, dof]
+
+
+ACTUATORS = {
+    "armature": ActuatorTerm("kg m^2", 0.1, "armature", lambda x, _, dof: x.joint_acceleration[:, dof], True),
+    "torque_offset": ActuatorTerm("N m", 5.0, "torque offset", lambda x, *_: torch.ones_like(x.time), needs_motor=True),
+    "asymmetric_coulomb": ActuatorTerm("N m", 1.0, "asymmetric Coulomb friction", _asymmetry_column),
+    "stribeck": ActuatorTerm("N m", 1.0, "Stribeck friction", _stribeck_column, nonnegative=True),
+    "stiffness": ActuatorTerm("N m/rad", 1.0, "stiffness", lambda x, _, dof: x.joint_position[:, dof], True),
+}
+"""Terms of actuators, each with a field of its name in `ExtraTerms` and in the settings `actuators`.
+
+Which of them a replay simulates, and a file of the robot has a place for, is said there (`torchid.commands.replay`,
+`torchid.report.robot_files`).
+"""
 
 
 @dataclass(frozen=True)
@@ -115,6 +146,11 @@ class Extra:
         return self.contacts[0] if self.contacts else None
 
     @property
+    def nonnegative(self) -> bool:
+        """Whether physics keeps it from being negative."""
+        return self.what in ACTUATORS and ACTUATORS[self.what].nonnegative
+
+    @property
     def label(self) -> str:
         """A unique name: "offset of l_sole fz", "offset of limb sensor l_ankle fz", "scale of *_hip,*_knee"."""
         limb = "limb sensor " if self.component and self.dofs else ""  # a link may have its joint's name
@@ -124,8 +160,7 @@ class Extra:
 
 def in_words(what: str) -> str:
     """A kind of extra parameters as labels have it: "asymmetric Coulomb friction"."""
-    words = what.replace("_", " ").replace("coulomb", "Coulomb friction")
-    return words.replace("stribeck", "Stribeck friction")
+    return ACTUATORS[what].words if what in ACTUATORS else what
 
 
 def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms) -> tuple[Extra, ...]:
@@ -145,11 +180,11 @@ def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, t
     for kind, groups in terms.scales.items():
         if not isinstance(groups, str):
             extras += _group_scales(kind, groups, [channel for channel in channels if channel.kind == kind])
-    for what, (unit, size) in ACTUATORS.items():
+    for what, term in ACTUATORS.items():
         if getattr(terms, what):
-            without = robot.is_passive if what in _OF_MOTORS else np.zeros_like(robot.is_passive)
+            without = robot.is_passive if term.needs_motor else np.zeros_like(robot.is_passive)
             measured = np.flatnonzero((sensors.torque & ~without)[: robot.n]).tolist()
-            extras += [Extra(what, robot.joint_names[dof], "", unit, size, False, (dof,)) for dof in measured]
+            extras += [Extra(what, robot.joint_names[dof], "", term.unit, term.size, False, (dof,)) for dof in measured]
     if terms.slope:
         motors = tuple(np.flatnonzero((sensors.torque & ~robot.is_passive)[: robot.n]).tolist())
         extras.append(Extra(SLOPE, "joint torques", "", "1", 1.0, False, motors))
@@ -280,18 +315,11 @@ def dof_extra_column(extra: Extra, dof: int, samples: Samples, tree: KinematicTr
     if extra.what == "scale":
         reading = samples.torque
         return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, dof]
+    if extra.what == "offset" or (extra.what == SLOPE and samples.slope is None):
+        return torch.ones_like(samples.time)
     if extra.what == SLOPE and samples.slope is not None:
         return samples.slope[:, dof]
-    if extra.what == "armature":
-        return samples.joint_acceleration[:, dof]
-    if extra.what == "stiffness":
-        return samples.joint_position[:, dof]
-    if extra.what == "asymmetric_coulomb":
-        return tree.coulomb_sign(samples.joint_velocity[:, dof]).abs()
-    if extra.what == "stribeck":
-        filtered = samples.stribeck
-        return tree.stribeck_share(samples.joint_velocity[:, dof]) if filtered is None else filtered[:, dof]
-    return torch.ones_like(samples.time)
+    return ACTUATORS[extra.what].column(samples, tree, dof)
 
 
 def contact_extra_column(extra: Extra, samples: Samples, contact: int, axis: int) -> Tensor:
