@@ -17,7 +17,7 @@ from walking import MACHINES, robot_of
 from torchid.commands.check import check_experiment
 from torchid.log_checks import NOTE, Checked
 from torchid.log_checks.check import check
-from torchid.log_checks.model import Declared
+from torchid.log_checks.equations import Declared
 from torchid.logs import Log
 from torchid.logs.segments import with_delayed_torques
 from torchid.problem import ExtraTerms

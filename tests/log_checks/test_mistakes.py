@@ -3,49 +3,31 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from faults import demo_log, demo_robot, of_demo, only, scaled
+from faults import demo_log, of_demo, only
 from flying import flight
-from mistaken import CUTOFF, MISTAKES, NAMED, SENSORS, Cell, case_of, cells, checked, judged
+from mistaken import MISTAKES, NAMED, SENSORS, Cell, case_of, cells, checked, judged
 from motions import value
-from recordings import in_world
-from scipy.spatial.transform import Rotation
-from synthetic import Oracle
-from thinned import STUDY
+from thinned import study_but
 from walking import MACHINES, robot_of, truth
 
 from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Finding, Skipped
 from torchid.log_checks.contacts import check_accelerometer
-from torchid.log_checks.mistakes import exchanged_names, joint_mistakes, possible_mistakes
-from torchid.log_checks.model import NominalModel, bind_some_samples, preprocess_pieces
-from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
+from torchid.log_checks.mistakes import exchanged_names
 from torchid.log_checks.standing_feet import measure_foot_slip
-from torchid.logs import Log
-from torchid.logs.preprocess import preprocess
-from torchid.regressor import Regressor
 
 EXPLAINED = "unit, sign or frame"
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
 #: Cells of the whole table that are not named, and why: see docs/measurements.md.
 UNNAMED = {("wrenches about another point", "biped", "contacts")}
 #: Of a robot that walks upright along the world's x axis, with all sensors.
-UPRIGHT = (
-    pytest.param("torques reversed", marks=pytest.mark.study),
-    pytest.param("wrenches reversed", marks=pytest.mark.study),
-    pytest.param("world downward", marks=pytest.mark.study),
-    pytest.param("contact flags left for right", marks=pytest.mark.study),
-    "quaternion w last for first",
-    pytest.param("quaternion inverse", marks=pytest.mark.study),
-    "time x 2",
-    "time in minutes",
-    "one torque x 1.3",
-    "torques of limbs exchanged",
-    "moments reversed",
+UPRIGHT = study_but(
+    ["quaternion w last for first", "time in minutes", "moments reversed"],
+    ["world downward", "contact flags left for right", "quaternion w last for first", "quaternion inverse"]
+    + ["time x 2", "time in minutes", "one torque x 1.3", "torques of limbs exchanged", "moments reversed"],
 )
 
 
@@ -63,64 +45,11 @@ def test_a_mistake_in_the_log_of_an_arm_is_named(name: str) -> None:
     assert BY_NAME[name].named(checked(case, value(BY_NAME[name].make(case))))
 
 
-@pytest.mark.parametrize(("machine", "sensors"), [("biped", "full"), ("arm", "joints")])
-def test_a_robot_unlike_its_urdf_gives_no_alarm(machine: str, sensors: str) -> None:
-    case = case_of(MACHINES[machine], sensors, heading=0.0 if machine == "biped" else None)
-    assert not [one for one in checked(case, case.log).findings if one.severity != NOTE]
-
-
-@pytest.mark.parametrize(("machine", "sensors"), [("quadruped", "full"), ("biped", "joints")])
-def test_what_passes_the_filter_may_be_corrected_after_it(machine: str, sensors: str) -> None:
-    log = case_of(MACHINES[machine], sensors).log.select(slice(0, 200))
-    of_joints = (one for one in joint_mistakes(log) if "reversed" in one.description)  # sums round otherwise
-    chosen = [mistake for mistake in (*possible_mistakes(log), *of_joints) if mistake.after_filter]
-    (filtered,) = preprocess_pieces(log, CUTOFF)
-    for mistake in chosen:
-        (expected,), found = preprocess_pieces(mistake.correct(log), CUTOFF), mistake.correct(filtered)
-        assert (found.joint_names, found.contact_names) == (expected.joint_names, expected.contact_names)
-        for name, x in expected.arrays().items():
-            size = max(1.0, float(np.nanmax(np.abs(x), initial=0.0)))
-            np.testing.assert_allclose(found.arrays()[name], x, rtol=0.0, atol=1e-12 * size, err_msg=f"{mistake}")
-    assert {"joint_names", "contact_names", "joint_torque"} <= {mistake.field for mistake in chosen}
-
-
 def test_an_accelerometer_is_told_from_the_world_by_where_the_feet_are_and_by_its_mean() -> None:
     case = case_of(MACHINES["quadruped"], "joints")
     of_gravity = ("with gravity twice", "without gravity", "along the world's axes")
     for name in ("accelerometer reversed", "world downward", *(f"accelerometer {one}" for one in of_gravity)):
         assert BY_NAME[name].named(checked(case, value(BY_NAME[name].make(case)))), name
-
-
-def test_factors_of_torques_and_of_time_are_recovered() -> None:
-    machine = MACHINES["arm"]
-    case, robot = case_of(machine, "contacts"), robot_of(machine)
-    slow = replace(case.log, time=3.0 * case.log.time)
-    found = fit_time_scale(slow, NominalModel(robot, ()), value(motion_cutoff_hz(slow)))
-    assert found.factor == pytest.approx(1.0 / 3.0, rel=0.1)
-    log = value(BY_NAME["one torque x 1.3"].make(case))
-    samples = bind_some_samples(preprocess_pieces(log, 10.0), robot, (), 240)
-    factors = value(fit_torque_gains(samples, NominalModel(robot, ())))
-    assert factors.gain[1] / np.median(factors.gain) == pytest.approx(1.0 / 1.3, abs=3.0 * factors.spread[1])
-
-
-def test_a_log_that_ends_elsewhere_than_it_began_moves_no_faster() -> None:
-    log, time = case_of(MACHINES["arm"], "contacts").log, np.arange(500) / 200.0
-    q = np.outer(np.sin(2.0 * np.pi * 0.9 * time), np.ones(len(log.joint_names)))
-    short = replace(log.select(np.arange(500)), time=time, joint_position=q)
-    assert value(motion_cutoff_hz(short)) < 10.0  # six times 0.9 Hz, and what a log of 2.5 s resolves
-
-
-def test_a_tool_that_the_urdf_lacks_is_not_taken_for_another_unit_of_time() -> None:
-    machine = MACHINES["arm"]
-    case, robot, mass, height = case_of(machine, "contacts"), robot_of(machine), 6.0, 0.1
-    tool = np.zeros((len(robot.bodies), 12))
-    tool[robot.links["panda_hand"][0], [0, 3, 4, 7]] = mass * np.array([1.0, height, height**2, height**2])
-    motion = (torch.from_numpy(x) for x in (case.happened.q, case.happened.v, case.happened.a))
-    carried = (Regressor(robot)(*motion) @ torch.from_numpy(tool.flatten())).numpy()
-    log = replace(case.log, joint_torque=value(case.log.joint_torque) + carried)
-    scale = value(fit_time_scale(log, NominalModel(robot, ()), value(motion_cutoff_hz(log))))
-    assert abs(np.log(scale.factor)) > np.log(1.5)  # less time makes up a part of what the tool needs
-    assert not [one for one in checked(case, log).findings if one.field == "time"]
 
 
 def test_feet_that_stand_do_not_move_and_tell_nothing_of_a_base_that_stands_still() -> None:
@@ -193,58 +122,6 @@ def test_a_finding_that_the_clean_log_has_too_does_not_count() -> None:
     case = case_of(MACHINES["arm"], "contacts")
     clean = checked(case, case.log)
     assert judged(BY_NAME["one torque x 1.3"], clean, clean) == "silent"
-
-
-def rolled(log: Log) -> Log:
-    return replace(log, base_quat_xyzw=np.roll(value(log.base_quat_xyzw), 1, axis=1))
-
-
-def inverted(log: Log) -> Log:
-    return replace(log, base_quat_xyzw=Rotation.from_quat(value(log.base_quat_xyzw)).inv().as_quat())
-
-
-def misnamed(log: Log) -> Log:
-    """World axes that are called the contact frames'."""
-    filled = preprocess(log)
-    world = value(in_world(Oracle.of(demo_robot()), filled).contact_wrench_world)
-    return replace(filled, contact_wrench_local=world)
-
-
-@pytest.mark.parametrize(
-    ("mistake", "field", "text"),
-    [
-        (lambda log: scaled(log, "joint_torque", 1e3), "joint_torque", "in Nmm or mNm"),
-        pytest.param(lambda log: scaled(log, "joint_torque", 1e-3), "joint_torque", "in kNm", marks=STUDY),
-        pytest.param(lambda log: scaled(log, "joint_torque", -1.0), "joint_torque", "all reversed", marks=STUDY),
-        pytest.param(
-            lambda log: scaled(log, "contact_wrench_local", 1e-3), "contact_wrench_local", "in kN", marks=STUDY
-        ),
-        (lambda log: scaled(log, "contact_wrench_local", 1.0 / 9.81), "contact_wrench_local", "in kg"),
-        (lambda log: scaled(log, "contact_wrench_local", -1.0), "contact_wrench_local", "all reversed"),
-        (misnamed, "contact_wrench_local", "along the world's axes"),
-        (rolled, "base_quat_xyzw", "w first against w last"),
-        (inverted, "base_quat_xyzw", "rotates world to base"),
-    ],
-    ids=["mN m", "kN m", "torques reversed", "kN", "kg", "wrenches reversed", "axes", "order", "inverse"],
-)
-def test_a_usual_mistake_is_named_by_what_it_explains(mistake: Callable[[Log], Log], field: str, text: str) -> None:
-    checked = of_demo(mistake(demo_log().select(slice(0, 600))))
-    explained = only(checked, EXPLAINED)
-    assert (explained.severity, explained.field) == (REJECTED, field)
-    assert explained.found.startswith(text)
-    assert "another robot" not in explained.advice
-    assert not checked.usable
-
-
-@pytest.mark.parametrize("parts", [("left", "right"), ("front", "rear")])
-def test_torques_of_exchanged_legs_are_named_beside_contact_forces_that_fit(parts: tuple[str, str]) -> None:
-    """All forces together are 29 to 33 % off, less than what is asked about: the wrenches fit."""
-    log, names = demo_log().select(slice(0, 600)), list(demo_log().joint_names)
-    one, other = parts
-    order = [names.index(name.replace(one, "?").replace(other, one).replace("?", other)) for name in names]
-    explained = only(of_demo(replace(log, joint_torque=value(log.joint_torque)[:, order])), EXPLAINED)
-    assert (explained.severity, explained.field) == (REJECTED, "joint_torque")
-    assert explained.found.startswith(f"{' and '.join(parts)} exchanged: measured torques differ")
 
 
 def test_two_legs_that_are_exchanged_beside_two_that_are_not_are_named() -> None:

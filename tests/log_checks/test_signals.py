@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faults import changed, demo_log, demo_robot, found, moving, of_demo, only, places, scaled, with_rates
+from faults import CONTACTS, changed, demo_log, demo_robot, found, moving, of_demo, only, places, scaled, with_rates
 from motions import angles, omega_base, position, slope, uniform, value, velocity
 from scipy.spatial.transform import Rotation
 
@@ -18,8 +18,12 @@ from torchid.log_checks import NOTE, REJECTED, SUSPICIOUS, Checked, Finding
 from torchid.log_checks.check import check
 from torchid.log_checks.contacts import check_weight
 from torchid.log_checks.motion import check_angle_unit, compare_derivative
+from torchid.log_checks.readings import check_excitation, check_rest, check_still_base
 from torchid.logs import Log, read_log, write_log
+from torchid.logs.preprocess import preprocess
 from torchid.logs.quaternion import angular_velocity_base
+from torchid.problem import bind_log
+from torchid.problem.samples import is_at_rest
 from torchid.robot import load_robot
 
 RATES = (
@@ -369,3 +373,52 @@ def test_what_the_feet_carry_at_rest_is_compared_with_the_weight() -> None:
 def test_without_a_robot_the_carried_mass_is_a_note_and_a_pull_still_wrong() -> None:
     assert "20.81 kg" in only(carried(robot=False), "weight").found
     assert not carried(-1.0, robot=False).usable
+
+
+def test_a_base_that_turns_in_one_place_is_named_unless_nothing_is_derived_from_that() -> None:
+    rates: dict[str, Any] = dict.fromkeys(("base_linear_velocity_world", "base_linear_acceleration_world"))
+    log = demo_log()
+    still = replace(log, base_position_world=np.tile(value(log.base_position_world)[:1], (len(log), 1)), **rates)
+    finding = only(of_demo(still), "constant position", "base_position_world")
+    assert finding.severity == SUSPICIOUS
+    assert "the base turns by 19 degrees" in finding.found
+    assert "base_motion: contacts" in finding.advice
+    driven = replace(still, base_linear_velocity_world=0.1 * np.random.default_rng(0).normal(size=(len(log), 3)))
+    (known,) = check_still_base(driven)
+    assert known.severity == NOTE
+    assert not list(check_still_base(replace(still, base_quat_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (len(log), 1)))))
+
+
+@pytest.mark.filterwarnings("ignore:.*no joint moves:torchid.errors.TorchidWarning")
+@pytest.mark.parametrize("moves", ["nothing", "a joint", "the base"])
+def test_a_log_in_which_nothing_moves_is_named(moves: str) -> None:
+    log = demo_log()
+    noise = np.random.default_rng(0).normal(scale=1e-4, size=(len(log), 1))
+    rest = {name: getattr(log, name)[:1] + noise for name in ("joint_position", "base_position_world")}
+    rest["base_quat_xyzw"] = np.tile(value(log.base_quat_xyzw)[:1], (len(log), 1))
+    if moves == "a joint":
+        rest["joint_position"][:, 3] = log.joint_position[:, 3]
+    elif moves == "the base":
+        rest["base_quat_xyzw"] = value(log.base_quat_xyzw)
+    still = replace(log, **rest)
+    assert is_at_rest([bind_log(preprocess(still, 8.0), demo_robot(), CONTACTS)]) == (moves == "nothing")
+    findings = list(check_excitation(still))
+    assert [(one.name, one.severity) for one in findings] == ([("no motion", NOTE)] if moves == "nothing" else [])
+
+
+def test_joints_that_rest_while_others_move_are_named_with_their_share_of_the_time() -> None:
+    log, rng, third = demo_log(), np.random.default_rng(0), len(demo_log()) // 3
+    position = log.joint_position.copy()
+    position[:, 2] = position[0, 2]
+    position[third : 2 * third, 5] = position[third, 5]
+    moves, rests = (
+        replace(log, joint_position=x + 1e-5 * rng.normal(size=x.shape)) for x in (log.joint_position, position)
+    )
+    assert list(check_rest(moves)) == []
+    [finding] = check_rest(rests)
+    assert (finding.name, finding.severity) == ("rest", NOTE)
+    assert finding.channels == (log.joint_names[2], log.joint_names[5])
+    shares = [float(x) for x in re.findall(r"(\d+) %", finding.found)]
+    assert shares[0] >= 98.0
+    assert 30.0 <= shares[1] <= 40.0
+    assert list(check_rest(replace(rests, joint_torque=None))) == []

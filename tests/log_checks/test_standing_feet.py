@@ -16,7 +16,7 @@ from stances import stance
 from walking import robot_of
 
 from torchid.log_checks import REJECTED, SUSPICIOUS, Finding
-from torchid.log_checks.model import recorded_link_poses, same_poses
+from torchid.log_checks.motion import recorded_link_poses, same_poses
 from torchid.log_checks.standing_feet import check_standing_feet
 from torchid.logs import Log
 from torchid.robot import load_robot

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from faults import changed, demo_log, found, moving, of_demo, only, scaled, with_rates
 from motions import uniform, value
-from thinned import study_but
 
 from torchid.log_checks import NOTE, REJECTED
 from torchid.log_checks.check import check
-from torchid.log_checks.model import ModelFit, TorqueFit
 from torchid.logs import Log
 from torchid.logs.units import UNITS, other_units, units_of_derivative_ratio, units_of_ratio
 
@@ -94,14 +92,6 @@ def test_gravity_that_was_taken_out_is_missed_without_rest() -> None:
     assert (finding.severity, "gravity has been taken out" in finding.found) == (REJECTED, True)
 
 
-@pytest.mark.parametrize("unit", study_but(["Ncm", "kgm"], ["Ncm", "kgcm", "kgm", "kNm"]))
-def test_joint_torques_in_another_unit_are_named(unit: str) -> None:
-    checked = of_demo(scaled(demo_log().select(slice(0, 600)), "joint_torque", 1.0 / UNITS["torque"][unit]))
-    finding = only(checked, "unit, sign or frame")
-    assert (finding.severity, finding.field) == (REJECTED, "joint_torque")
-    assert f"logs.columns.joint_torque.unit: {unit}" in finding.advice
-
-
 @pytest.mark.parametrize("unit", ["mm", "cm"])
 def test_a_base_position_in_another_unit_is_named_by_standing_feet(unit: str) -> None:
     log = demo_log().select(slice(0, 600))
@@ -121,12 +111,3 @@ def test_numbers_in_every_unit_are_recognised_by_their_size(quantity: str) -> No
     assert {unit for units in other_units(quantity) for unit in units.split(" or ")} == {
         unit for unit, factor in UNITS[quantity].items() if factor != 1.0
     }
-
-
-@pytest.mark.parametrize(("reversed_joints", "most"), [(2, True), (1, False)])
-def test_torques_are_mostly_implausible_where_more_than_half_of_their_factors_are(
-    reversed_joints: int, most: bool
-) -> None:
-    gain, every = np.where(np.arange(3) < reversed_joints, -1.0, 1.0), np.ones(3, dtype=bool)
-    fit = TorqueFit(np.arange(3), gain, every, ~every, np.ones(3), size=1.0, misfit=0.9, misfit_corrected=0.06)
-    assert ModelFit(fit, None, None).mostly_implausible is most

@@ -37,9 +37,9 @@ from torchid.fitting.noise import (
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass, estimate_extras, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
+from torchid.log_checks.equations import NominalModel
 from torchid.log_checks.findings import SEVERITIES
-from torchid.log_checks.lags import check_tilt
-from torchid.log_checks.model import NominalModel
+from torchid.log_checks.unknowns import check_tilt
 from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem, Samples
 from torchid.problem.metrics import ADVICE, Metrics, WorseThanNominal, describe_worse

@@ -31,7 +31,7 @@ from torchid.fitting.left_out import RIDGE, RIDGES, STRONGER, RidgeChoice, choos
 from torchid.fitting.noise import NoiseSummary, estimate_noise, mean_noise_square, recorded_sensors
 from torchid.fitting.prior_knowledge import conditions_from, known_masses
 from torchid.fitting.robust import RobustLoss
-from torchid.log_checks.model import Declared
+from torchid.log_checks.equations import Declared
 from torchid.logs.columns import fits, for_all, require_names, values_of_all
 from torchid.logs.ros_topics import Topics, require_joints
 from torchid.parameters import Array

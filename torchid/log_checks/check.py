@@ -22,7 +22,7 @@ from torchid.log_checks.contacts import (
     check_weight,
     subtract_contact_offsets,
 )
-from torchid.log_checks.encoders import check_single_joints, check_still_velocities
+from torchid.log_checks.equations import Declared
 from torchid.log_checks.findings import (
     REJECTED,
     SEVERITIES,
@@ -35,12 +35,12 @@ from torchid.log_checks.findings import (
     refused,
 )
 from torchid.log_checks.forces import check_forces_against_urdf
-from torchid.log_checks.model import Declared
 from torchid.log_checks.motion import (
     check_angle_unit,
     check_angular_velocity,
     check_derivatives,
     check_loops,
+    check_still_velocities,
     completed,
 )
 from torchid.log_checks.readings import (
@@ -214,9 +214,7 @@ def _check_forces(
 ) -> Iterator[Finding | Skipped]:
     """Whether forces agree with the robot's file; arguments as of `check`."""
     unbiased = subtract_contact_offsets(log)
-    found = list(check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, declared, required))
-    yield from found
-    yield from check_single_joints(unbiased, robot, contacts, cutoff_hz, declared, found)
+    yield from check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived, declared, required)
     yield from check_limb_sensors(log, robot, contacts, cutoff_hz)
 
 

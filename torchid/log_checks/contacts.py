@@ -9,6 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchid.errors import InputError, format_count, format_percent
+from torchid.log_checks.equations import (
+    COMPARED_SAMPLES,
+    MAX_DIFFERENTIATED_SAMPLES,
+    bind_some_samples,
+    default_cutoff_hz,
+    preprocess_pieces,
+)
 from torchid.log_checks.findings import (
     NOTE,
     REJECTED,
@@ -21,14 +28,7 @@ from torchid.log_checks.findings import (
     widen_mask,
 )
 from torchid.log_checks.mistakes import quarter_turns
-from torchid.log_checks.model import (
-    COMPARED_SAMPLES,
-    MAX_DIFFERENTIATED_SAMPLES,
-    bind_some_samples,
-    default_cutoff_hz,
-    preprocess_pieces,
-    recorded_link_poses,
-)
+from torchid.log_checks.motion import recorded_link_poses
 from torchid.logs import Log
 from torchid.logs.log import FORCE_NORMAL, BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_base, rotate_to_world
@@ -146,60 +146,69 @@ def _rotate_to_world(log: Log, robot: Robot, force: FloatArray) -> FloatArray:
 
 
 def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
-    """Findings about the IMU's specific force at rest, and about its direction on average over a long log."""
-    if log.imu_specific_force is None:
+    """Findings about the IMU's specific force at rest, else on average over a long log."""
+    reading = log.imu_specific_force
+    if reading is None:
         return
     still = _find_rest(log)
-    rests = still.sum() >= 10
-    if not rests:
-        found = _accelerometer_in_motion(log, robot)
-        yield found or Skipped(_ACCELEROMETER_CHECK, f"the robot never rests for {_MIN_REST_S:g} s")
-        mistaken = found is not None and found.name == "gravity"
-        if mistaken or log.base_quat_xyzw is None or log.time[-1] - log.time[0] < _MIN_AVERAGING_S:
-            return
-        yield from _tilt_findings(log, robot, np.ones(len(log), bool), "on average")
+    rests = bool(still.sum() >= 10)
+    if not rests and log.time[-1] - log.time[0] < _MIN_AVERAGING_S:
+        yield Skipped(_ACCELEROMETER_CHECK, f"the robot never rests for {_MIN_REST_S:g} s")
         return
-    mean = log.imu_specific_force[still].mean(axis=0)
-    size = float(np.linalg.norm(mean))
-    name, text = "imu_specific_force", f"{size:.4g} m/s^2 at rest"
-    if units := units_of_ratio(size / GRAVITY, ("acceleration",), _ACCELEROMETER_UNIT_TOLERANCE):
-        yield _accelerometer_unit_finding(f"{size:.4g} at rest", units)
-    elif size < 0.1 * GRAVITY:
-        yield _no_gravity_finding(text)
-    elif _is_twice_gravity(size):
-        yield _twice_gravity_finding(text)
-    elif abs(size / GRAVITY - 1.0) > _MAX_ACCELEROMETER_ERROR:
-        yield Finding("gravity", SUSPICIOUS, name, f"{text}, gravity is {GRAVITY}", "calibrate the accelerometer")
-    if units or size > 0.5 * GRAVITY:
-        yield from _tilt_findings(log, robot, still, "at rest")
-
-
-def _accelerometer_in_motion(log: Log, robot: Robot | None) -> Finding | None:
-    """Finding about unit or gravity of an accelerometer that never rests, by mean and median size, over a long log.
-
-    Both are gravity's for a base that hardly turns and falls; of one without gravity, the mean is nearly zero. Along
-    the world's axes the mean is gravity however the base accelerates: its velocity does not grow.
-    """
-    if log.imu_specific_force is None or log.time[-1] - log.time[0] < _MIN_AVERAGING_S:
-        return None
-    mean, size = (
-        float(np.linalg.norm(log.imu_specific_force.mean(axis=0))),
-        float(np.median(np.linalg.norm(log.imu_specific_force, axis=1))),
-    )
+    used = still if rests else np.ones(len(log), bool)
+    mean = float(np.linalg.norm(reading[used].mean(axis=0)))
+    size = mean if rests else float(np.median(np.linalg.norm(reading, axis=1)))
+    text = f"{size:.4g} m/s^2 {'at rest' if rests else 'in the median'}"
     by_mean, by_size = (
         units_of_ratio(x / GRAVITY, ("acceleration",), _ACCELEROMETER_UNIT_TOLERANCE) for x in (mean, size)
     )
     units = tuple(unit for unit in by_size if unit in by_mean)
+    if not rests and not units:
+        mean, size = _mean_along_world(log, robot) or (mean, size)
+    finding = _gravity_finding(mean, size, text, units, rests)
+    if finding is not None:
+        yield finding
+    elif not rests:
+        yield Skipped(_ACCELEROMETER_CHECK, f"the robot never rests for {_MIN_REST_S:g} s")
+    has_direction = size > 0.5 * GRAVITY if rests else finding is None or finding.name != "gravity"
+    if units or has_direction:
+        yield from _tilt_findings(log, robot, used, "at rest" if rests else "on average")
+
+
+def _gravity_finding(mean: float, size: float, text: str, units: tuple[str, ...], rests: bool) -> Finding | None:
+    """Finding about the unit or the gravity of a reading, by the size of its mean and its median size [m/s^2].
+
+    Both are gravity's for a base that hardly turns and falls; of one without gravity, the mean is nearly zero.
+    """
+    field = "imu_specific_force"
+    original = "give the reading of the accelerometer"
     if units:
-        return _accelerometer_unit_finding(f"{size:.4g} in the median", units)
-    text, in_base = f"{size:.3g} m/s^2 in the median", _specific_force_in_base(log, robot)
-    if in_base is not None and log.base_quat_xyzw is not None:
-        vertical = rotate_to_base(log.base_quat_xyzw, np.tile([0.0, 0.0, 1.0], (len(log), 1))).mean(axis=0)
-        if np.linalg.norm(vertical) > _MIN_MEAN_VERTICAL:
-            mean = size = float(np.linalg.norm(rotate_to_world(log.base_quat_xyzw, in_base).mean(axis=0)))
+        advice = f"{advise_units({field: units})}; without a map convert it to m/s^2"
+        return Finding("unit", REJECTED, field, f"{text.replace(' m/s^2', '')}: in {' or '.join(units)}", advice)
     if mean < _MAX_MEAN_WITHOUT_GRAVITY * GRAVITY and size < _MAX_SIZE_WITHOUT_GRAVITY * GRAVITY:
-        return _no_gravity_finding(text)
-    return _twice_gravity_finding(text) if _is_twice_gravity(mean) and _is_twice_gravity(size) else None
+        advice = f"{original}: acceleration minus gravity, upward at rest"
+        return Finding("gravity", REJECTED, field, f"{text}: gravity has been taken out", advice)
+    if max(abs(x / (2.0 * GRAVITY) - 1.0) for x in (mean, size)) < _ACCELEROMETER_UNIT_TOLERANCE:
+        advice = f"{original}, to which nothing was added; or halve it, if its range is another"
+        return Finding("gravity", REJECTED, field, f"{text}: gravity is in it twice", advice)
+    if rests and abs(size / GRAVITY - 1.0) > _MAX_ACCELEROMETER_ERROR:
+        return Finding("gravity", SUSPICIOUS, field, f"{text}, gravity is {GRAVITY}", "calibrate the accelerometer")
+    return None
+
+
+def _mean_along_world(log: Log, robot: Robot | None) -> tuple[float, float] | None:
+    """Size of the mean along the world's axes, twice; None where that is not known, or the base turns over.
+
+    That mean is gravity however the base accelerates: its velocity does not grow.
+    """
+    in_base = _specific_force_in_base(log, robot)
+    if in_base is None or log.base_quat_xyzw is None:
+        return None
+    vertical = rotate_to_base(log.base_quat_xyzw, np.tile([0.0, 0.0, 1.0], (len(log), 1))).mean(axis=0)
+    if np.linalg.norm(vertical) <= _MIN_MEAN_VERTICAL:
+        return None
+    size = float(np.linalg.norm(rotate_to_world(log.base_quat_xyzw, in_base).mean(axis=0)))
+    return size, size
 
 
 def _specific_force_in_base(log: Log, robot: Robot | None) -> FloatArray | None:
@@ -207,26 +216,6 @@ def _specific_force_in_base(log: Log, robot: Robot | None) -> FloatArray | None:
     if log.imu_specific_force is None or robot is None or robot.links.get(log.imu_frame, (1, None))[0] != 0:
         return None
     return np.asarray(log.imu_specific_force @ robot.links[log.imu_frame][1][:3, :3].T)
-
-
-def _is_twice_gravity(size: float) -> bool:
-    return abs(size / (2.0 * GRAVITY) - 1.0) < _ACCELEROMETER_UNIT_TOLERANCE
-
-
-def _twice_gravity_finding(text: str) -> Finding:
-    advice = "give the reading of the accelerometer, to which nothing was added; or halve it, if its range is another"
-    return Finding("gravity", REJECTED, "imu_specific_force", f"{text}: gravity is in it twice", advice)
-
-
-def _no_gravity_finding(text: str) -> Finding:
-    advice = "give the reading of the accelerometer: acceleration minus gravity, upward at rest"
-    return Finding("gravity", REJECTED, "imu_specific_force", f"{text}: gravity has been taken out", advice)
-
-
-def _accelerometer_unit_finding(text: str, units: tuple[str, ...]) -> Finding:
-    field = "imu_specific_force"
-    advice = f"{advise_units({field: units})}; without a map convert it to m/s^2"
-    return Finding("unit", REJECTED, field, f"{text}: in {' or '.join(units)}", advice)
 
 
 def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -> Iterator[Finding | Skipped]:
@@ -565,17 +554,17 @@ def check_limb_sensors(
         return
     try:
         pieces = preprocess_pieces(log, cutoff_hz or default_cutoff_hz(log))
-        parts = bind_some_samples(pieces, robot, contacts, 4 * COMPARED_SAMPLES)
+        samples = bind_some_samples(pieces, robot, contacts, 12 * COMPARED_SAMPLES)
     except InputError:  # reported by `check_forces_against_urdf`
         return
     builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names)))
-    series = [force_series(builder, part, robot.nominal.flatten()[None]) for part in parts]
-    active = np.concatenate([part.active.numpy() for part in parts])
+    measured_series, (model_series,) = force_series(builder, samples, robot.nominal.flatten()[None])
+    active = samples.active.numpy()
     for number, name in enumerate(robot.ft_names):
         if name not in log.ft_names:
             continue
         force = slice(robot.base_rows + robot.n + 6 * number, robot.base_rows + robot.n + 6 * number + 3)
-        measured, model = (np.concatenate([s[i][..., force].reshape(-1, 3) for s in series]) for i in (0, 1))
+        measured, model = measured_series[:, force], model_series[:, force]
         beyond = _contacts_beyond(robot, contacts, name)
         air = ~active[:, beyond].any(axis=1) & np.isfinite(measured).all(axis=1)
         if not beyond and not robot.fixed_base and not contacts:

@@ -1,59 +1,46 @@
-"""Measured forces against the URDF's: signs, units, scales, exchanged joints, and what explains a misfit."""
+"""Measured forces against the URDF's: what a fit would refuse, and the mistake that explains them best."""
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from torchid.errors import InputError
-from torchid.log_checks.encoders import check_encoders, is_bolted_arm, single_zero_findings
-from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, refused
-from torchid.log_checks.lags import check_lag_and_tilt, check_torque_offsets, without_lag
-from torchid.log_checks.mistakes import Mistake, accelerometer_axes, joint_mistakes, possible_mistakes
-from torchid.log_checks.model import (
-    MAX_TRIAL_DIFFERENTIATED_SAMPLES,
-    TRIAL_SAMPLES,
+from torchid import parameters
+from torchid.errors import InputError, format_percent, join_names
+from torchid.log_checks.equations import (
+    DECLARED_SCALE,
+    MIN_BLOCK_SHARE,
+    SCALED_TORQUE_STD,
     UNMODELLED_FORCE_SHARE,
     Declared,
-    ModelFit,
+    FilteredLog,
+    ForceEquations,
     NominalModel,
-    TorqueFit,
     bind_some_samples,
     default_cutoff_hz,
+    equations_of,
     preprocess_pieces,
-    torque_findings,
-    without_friction,
+    reach,
+    reading_noise,
 )
-from torchid.log_checks.scales import (
+from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, median_step, refused
+from torchid.log_checks.mistakes import Mistake, joint_mistakes, possible_mistakes
+from torchid.log_checks.motion import still_joints
+from torchid.log_checks.unknowns import (
     MAX_LEFT,
-    MIN_BLOCK_SHARE,
+    MIN_UNEXPLAINED,
     MIN_UNEXPLAINED_RATIO,
-    TIME_BLOCKS,
-    DeviationRows,
-    FilteredLog,
-    NormalEquations,
-    TimeScale,
-    accumulate_blocks,
-    common_factor_notes,
-    common_gain_findings,
-    fit_time_scale,
-    fit_torque_gains,
-    gain_and_point_findings,
-    motion_cutoff_hz,
+    READINGS,
+    Explanation,
+    best_explanation,
 )
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES, FloatArray
 from torchid.logs.segments import with_delayed_torques
-from torchid.logs.signal_noise import rough_noise
 from torchid.parallel import one_thread
-from torchid.parameters import COULOMB, VISCOUS
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import subsample_states
 from torchid.problem.contact_state import state_name
@@ -63,12 +50,52 @@ from torchid.sensing import Contact, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values
 from torchid.settings import AUTO
 
+#: What the best URDF near the given one leaves of the forces, in `UNMODELLED_FORCE_SHARE` of these, from which on they
+#: contradict the URDF. Of simulated logs clean ones leave 0.4 at most, those with a mistake without a row 4.8 or more.
+MIN_CONTRADICTION = 2.0
+#: What a factor of time may leave of them.
+_MAX_LEFT_BY_TIME = 1.0
+#: Share of what is unexplained that the correction of a usual mistake may leave.
+MAX_CORRECTED_SHARE = 0.5
+#: Corrections that explain as much as the best one, up to this ratio, are named beside it.
+_ALIKE_RATIO = 1.1
+#: Evenly spread samples of each corrected log.
+TRIAL_SAMPLES = 120
 #: Samples of each contact state whose rank is counted, and states that a finding names.
-_SAMPLES, _NAMED = 60, 3
+_RANK_SAMPLES, _NAMED = 60, 3
+#: Factor of time that no error of inertias explains: its square is 2.25.
+MIN_TIME_FACTOR = 1.5
+#: Factors of time that are tried, and that at which accelerations vanish.
+_TIME_FACTORS, _REST_FACTOR = np.geomspace(1e-4, 1e4, 1601), 1e4
+#: Unexplained forces with the recorded time, or at rest, over those with the corrected time; the same where that leaves
+#: more than `_MAX_LEFT_BY_TIME`: an arm with a tool of 2.5 kg that its URDF does not have is explained half as badly by
+#: 0.66 times the time.
+_MIN_TIME_RATIO, _MIN_TIME_RATIO_OF_ANOTHER_ROBOT = 1.5, 10.0
+_TIME_UNITS = {60.0: "minutes", 1e-3: "ms", 1e3: "ks", 3600.0: "hours"}
+#: Share of the power of positions within the bandwidth of the motion, the cutoff over that bandwidth, its minimum in
+#: periods per log (the filter spoils two at each end), and its maximum over the sample rate.
+_MOTION_POWER_SHARE, _CUTOFF_BANDWIDTHS, _MIN_CUTOFF_PERIODS, _MAX_CUTOFF_RATE_SHARE = 0.99, 6.0, 20.0, 0.2
+#: What dry friction may carry of the largest load where a joint stands still.
+MAX_FRICTION_SHARE = 0.2
+#: Share of what is unexplained that the torque of a joint that stands still must make up.
+_MIN_DEAD_SHARE = 0.36
+#: Friction of a joint over all else in its torque, from which on it tells the sign of the torque.
+_MIN_FRICTION_RATIO = 2.0
+#: Largest moment of inertia over the sum of all three: plates have 0.5, and files round.
+_MAX_MOMENT_SHARE = 0.51
+#: Density of a ball of the same mass and radius of gyration [kg/m^3]: less than of air, more than of lead or tungsten.
+_MIN_DENSITY, _MAX_DENSITY = 1.0, 20_000.0
+#: Volume of a ball over the third power of its radius of gyration.
+_BALL_VOLUME = 4.0 / 3.0 * np.pi * (5.0 / 3.0) ** 1.5
+#: Share of the robot's mass below which bodies are not looked at, and number of bodies that may be alike.
+_MIN_MASS_SHARE, _MIN_BODIES, _TINY = 1e-4, 4, 1e-9
+#: Range of the moments of inertia of a body, over the largest, that counts as rounding.
+_EQUAL_MOMENTS = 1e-6
+_FORCE_CHECK = "forces against the model"
 
 
 def check_required(
-    samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact], required: SensorSet, goes_on: bool
+    samples: Samples, robot: Robot, contacts: Sequence[Contact], required: SensorSet, goes_on: bool
 ) -> Iterator[Finding]:
     """Findings about a log that a fit would refuse.
 
@@ -80,8 +107,7 @@ def check_required(
         goes_on: whether it goes on where the base is lost.
     """
     try:
-        for part in samples:
-            require_forces(part, robot, contacts, required)
+        require_forces(samples, robot, contacts, required)
     except InputError as error:
         yield refused(error)
     if not robot.fixed_base and not goes_on:
@@ -90,10 +116,11 @@ def check_required(
 
 @one_thread()
 @torch.no_grad()
-def _lost_base(samples: Sequence[Samples], builder: RowBuilder) -> Iterator[Finding]:
+def _lost_base(samples: Samples, builder: RowBuilder) -> Iterator[Finding]:
     """A finding about contact states in which rank(S_b V_x) is below 6 in most samples."""
-    ranks, counts = defaultdict[str, list[torch.Tensor]](list), Counter[str]()
-    for part, state, weight in subsample_states(samples, _SAMPLES):
+    ranks = defaultdict[str, list[torch.Tensor]](list)
+    counts = Counter[str]()
+    for part, state, weight in subsample_states([samples], _RANK_SAMPLES):
         name = state_name(builder.contacts, state)
         counts[name] += round(weight * len(part))
         for _, V in builder.null_space_bases(state, builder.kinematics(part)):
@@ -106,167 +133,6 @@ def _lost_base(samples: Sequence[Samples], builder: RowBuilder) -> Iterator[Find
         advice = "measure more (torchid analyze finds what suffices), leave such samples out, or set"
         advice += " sensors.on_base_lost: warn"
         yield Finding("does not fit", REJECTED, "sensors", text, advice)
-
-
-_TINY = 1e-9
-
-#: Share of the exchange that corrected torques still ask for: a scale or an offset of one of the two asks for others.
-_MAX_SHARE_LEFT = 0.25
-#: Readings of a torque whose noise is looked at.
-_MIN_READINGS = 20
-#: Third singular value of two joints' motions over the first, of more than one rate.
-_MIN_THIRD = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class _Exchanges:
-    """What all pairs of joints (P, 2) explain if their torques are exchanged.
-
-    Attributes:
-        pairs: numbers of the joints.
-        share: (P,) of the exchange that fits best: 1 where it is a mistake, 0 where it is none.
-        without: unexplained forces without any exchange, rms in deviations of the torques.
-        left: (P,) the same with it.
-        equations: of what the nominal parameters leave, and of the pairs.
-    """
-
-    pairs: NDArray[np.intp]
-    share: FloatArray
-    without: float
-    left: FloatArray
-    equations: NormalEquations
-
-    def gains(self, pair: int) -> FloatArray:
-        """By how much less is unexplained with one exchange, squared, by block of time, (TIME_BLOCKS,)."""
-        one, both = self.equations, [0, 1 + pair]
-        alone = replace(one, KtY=one.KtY[..., both], YtY=one.YtY[:, both][..., both])
-        by_block = (alone.unexplained(block) for block in range(TIME_BLOCKS))
-        return np.array([2.0 * G[0, 1] - G[1, 1] for G in by_block])
-
-
-def check_exchanged_torques(filtered: FilteredLog) -> Finding | None:
-    """A finding about two joints whose torques fit the model in each other's place, and only there.
-
-    Torques are compared by the model's in the null space of contacts without a sensor, beside all parameters near the
-    URDF's and friction, and relative to each joint's own, so that wrists count as much as shoulders. The exchanged log
-    decides, by its own deviations: it must leave little, and the log as recorded more. Before, those of two joints of
-    other sizes are wrong, which candidates by a deviation of all torques alike make up for.
-
-    Args:
-        filtered: the log.
-    """
-    if filtered.log.joint_torque is None or not np.isfinite(filtered.log.joint_torque).any():
-        return None
-    with suppress(InputError):  # reported by `check_forces_against_urdf`
-        robot, noise = filtered.model.robot, _noise_of_readings(filtered)
-        alike, own = filtered.rows, _rows(filtered, filtered.samples, noise)
-        tried = list[tuple[int, ...]]()
-        for rows in (alike, own):
-            found = None if rows is None else _fit_exchanges(rows, robot)
-            best = 0 if found is None else int(np.argmin(found.left))
-            if found is None or tuple(found.pairs[best]) in tried or not (found.gains(best) > 0.0).all():
-                continue
-            pair, order = found.pairs[best], np.arange(robot.n_dofs)
-            tried.append(tuple(pair))
-            if not _is_told(filtered.samples, pair):
-                continue
-            order[pair] = pair[::-1]
-            corrected = [replace(x, torque=None if x.torque is None else x.torque[:, order]) for x in filtered.samples]
-            again = _rows(filtered, corrected, noise[order[: robot.n]])
-            after = None if again is None else _fit_exchanges(again, robot)
-            if after is not None and _is_right(after, best):
-                return _finding(filtered, pair, after.left[best] / max(after.without, _TINY))
-    return None
-
-
-def _is_told(samples: Sequence[Samples], pair: NDArray[np.intp]) -> bool:
-    """Whether two joints move at more than one rate: of a sine, either one's torques fit both."""
-    parts = [torch.cat([x.joint_position, x.joint_velocity, x.joint_acceleration], 1) for x in samples]
-    motion = torch.cat([x.unflatten(1, (3, -1))[..., pair.tolist()].flatten(1) for x in parts])
-    motion = motion - motion.mean(0)
-    size = torch.linalg.svdvals(motion / torch.linalg.vector_norm(motion, dim=0).clamp(min=_TINY))
-    return bool(size[2] > _MIN_THIRD * size[0])
-
-
-def _is_right(after: _Exchanges, pair: int) -> bool:
-    """Whether torques fit as they are, and not if those of a pair are exchanged."""
-    worse = after.left[pair] > MIN_UNEXPLAINED_RATIO * after.without and (after.gains(pair) < 0.0).all()
-    return bool(worse and after.without < MAX_LEFT and abs(after.share[pair]) < _MAX_SHARE_LEFT)
-
-
-def _finding(filtered: FilteredLog, pair: NDArray[np.intp], ratio: float) -> Finding:
-    first, second = (filtered.model.robot.joint_names[joint] for joint in sorted(pair))
-    text = f"{first} and {second} exchanged: {ratio:.2g} times as much of the torques is unexplained as once corrected"
-    advice = "give torques in the order of joint_names, as positions"
-    return Finding("unit, sign or frame", REJECTED, "joint_torque", text, advice, (first, second))
-
-
-def _noise_of_readings(filtered: FilteredLog) -> FloatArray:
-    """Standard deviation of each joint's torque readings from sample to sample (n,), in the robot's order."""
-    log, names = filtered.log, filtered.model.robot.joint_names
-    noise, torque = np.zeros(len(names)), np.asarray(log.joint_torque)
-    for name, column in zip(log.joint_names, torque.T, strict=True):
-        known = column[np.isfinite(column)]
-        if name in names and len(known) >= _MIN_READINGS:
-            noise[names.index(name)] = rough_noise(known[:, None]).item()
-    return noise
-
-
-def _rows(filtered: FilteredLog, samples: Sequence[Samples], noise: FloatArray) -> DeviationRows | None:
-    """Rows of torques relative to each joint's own and to the `noise` of its readings (n,)."""
-    torque = np.concatenate([x.torque[:, : len(noise)].numpy() for x in samples if x.torque is not None])
-    size = np.sqrt(np.square(np.nan_to_num(torque)).mean(axis=0))
-    return DeviationRows.of(samples, filtered.model, np.hypot(UNMODELLED_FORCE_SHARE * size, noise))
-
-
-def _fit_exchanges(rows: DeviationRows, robot: Robot) -> _Exchanges | None:
-    """All exchanges of the torques of two joints, None where fewer than two were measured."""
-    builder, n, base = rows.builder, robot.n, robot.base_rows
-    measured = (builder.sensors.torque & ~robot.is_passive)[:n]
-    pairs = np.array(list(itertools.combinations(np.flatnonzero(measured).tolist(), 2)))
-    if not len(pairs):
-        return None
-    parts = []
-    for part, (W, equations, K, target) in zip(rows.samples, rows.parts, strict=True):
-        read = builder.recorded_torque(part)[:, :n].numpy()
-        first, second = pairs.T
-        of_joints = W[:, base : base + n]
-        change = (of_joints[:, first] - of_joints[:, second]) * (read[:, second] - read[:, first])[..., None]
-        Y = np.concatenate([target[..., None], change.transpose(0, 2, 1)], axis=2)
-        parts.append((K[..., : K.shape[2] - n], Y, equations))  # without offsets, which a load at rest may be
-    normal = accumulate_blocks(parts)
-    G = normal.unexplained()
-    product, square = G[0, 1:], np.diag(G)[1:]
-    count = max(normal.rows, 1)
-    left = np.sqrt(np.maximum(G[0, 0] - 2.0 * product + square, 0.0) / count)
-    share = product / np.where(square > 0.0, square, np.inf)
-    return _Exchanges(pairs, share, float(np.sqrt(max(G[0, 0], 0.0) / count)), left, normal)
-
-
-#: Misfit above which common mistakes are tried. A URDF that is 20 % off leaves 0.05 to 0.1, one with links missing 0.3.
-MAX_MISFIT = 0.4
-#: Residual of the best URDF near the given one, in `UNMODELLED_FORCE_SHARE` of the forces, up to which a misfit is not
-#: reported: the moments about a standing base are small, and a centre of mass 1 cm off is a large share of them.
-MAX_UNEXPLAINED_RATIO = 1.0
-#: Share of the misfit that a corrected mistake may leave. Misfits above 1, that of zero forces, count as 1: forces that
-#: are far too large fit better after any reduction.
-MAX_FORCE_RESIDUAL_SHARE = 0.5
-#: Misfit that a corrected mistake leaves, above which it may be another robot that the forces are of: 0.05 to 0.1 is a
-#: URDF that is 20 % off, 0.33 was a robot of four times the weight whose torques were taken for kg m.
-MAX_CLEAR_MISFIT = 0.2
-#: The same, above which it may be another factor than that of a unit: those of currents are anything.
-_MAX_UNIT_MISFIT = 0.1
-#: Factor of time that no error of inertias explains: its square is 2.25.
-MIN_TIME_FACTOR = 1.5
-#: Unexplained forces with the recorded time, or at rest, over those with the corrected time.
-_MIN_UNEXPLAINED_RATIO_OF_TIME = 1.5
-#: The same of the recorded time where the corrected time leaves more than `MAX_UNEXPLAINED_RATIO`: an arm with a tool
-#: of 2.5 kg that its URDF does not have is explained half as badly by 0.66 times the time (2.4 instead of 4.5).
-_MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT = 10.0
-#: Factors from another unit of time to seconds, and their tolerance.
-TIME_UNIT_FACTORS = {60.0: "minutes", 1e-3: "ms", 1e3: "ks", 3600.0: "hours"}
-_TIME_UNIT_TOLERANCE = 0.1
-_FORCE_CHECK = "forces against the model"
 
 
 def check_forces_against_urdf(
@@ -292,250 +158,319 @@ def check_forces_against_urdf(
     if robot is None:
         yield Skipped(_FORCE_CHECK, "no robot (--urdf)")
         return
-    cutoff, model = cutoff_hz or default_cutoff_hz(log), NominalModel(robot, contacts, declared or Declared())
+    noise = 0.0 if log.joint_torque is None else reading_noise(log, robot)
+    model = NominalModel(robot, contacts, declared or Declared(), noise)
+    log = with_delayed_torques(log, model.declared.known_delay)
+    filtered = FilteredLog(log, model, cutoff_hz or default_cutoff_hz(log))
     try:
-        log = with_delayed_torques(log, model.declared.known_delay)
-        logs = preprocess_pieces(log, cutoff)
-    except InputError as error:  # too short, or sampled too slowly by its time stamps
+        filtered.pieces  # noqa: B018 (too short, or sampled too slowly by its time stamps)
+    except InputError as error:
         skipped = Skipped(_FORCE_CHECK, f"{error.field}: {error.found}") if required is None else refused(error)
-        yield _time_scale_finding(_fit_time_scale(log, model)) or skipped
+        scale = _time_scale(log, model)
+        yield skipped if scale is None else scale.findings[0]
         return
     try:
-        samples = bind_some_samples(logs, robot, contacts)
+        samples = bind_some_samples(filtered.pieces, robot, contacts)
     except InputError as error:
         yield refused(error)
         return
     if required is not None:
         yield from check_required(samples, robot, contacts, required, model.declared.goes_on_without_base)
-    if log.joint_torque is None and log.contact_wrench is None:
+    filtered = _with_declared_scales(filtered)
+    if filtered.equations is None:
         yield Skipped(_FORCE_CHECK, "neither joint torques nor contact wrenches")
     else:
-        yield from _misfit_findings(log, samples, model, cutoff, derived)
+        yield from _mistakes(filtered, filtered.equations, derived)
 
 
-def _misfit_findings(
-    log: Log, samples: Sequence[Samples], model: NominalModel, cutoff: float, derived: tuple[str, ...]
-) -> Iterator[Finding | Skipped]:
-    """The mistake that explains forces unlike the URDF's, or single deviations of forces that are like them."""
-    fit, robot = model.compare(samples), model.robot
-    if fit.largest_misfit > MAX_MISFIT and (bare := without_friction(robot)) is not None:
-        without = replace(model, robot=bare)
-        better = without.compare(samples)
-        if better.largest_misfit <= MAX_MISFIT or _is_mostly_friction(fit, better):
-            yield _friction_finding(robot, fit, better)
-            robot, model, fit = bare, without, better
-    filtered = FilteredLog(log, model, cutoff)
-    explanation = _explanation(filtered, fit, derived)
-    if explanation is not None:
-        yield explanation
+def _has_scaled_torques(model: NominalModel) -> bool:
+    """Whether the sizes of an arm's torques with declared unknown scales are those that its URDF requires."""
+    return "joint_torque" in model.declared.terms.scales and model.is_bolted_arm
+
+
+def _with_declared_scales(filtered: FilteredLog) -> FilteredLog:
+    """The log of a bolted arm with torques times factors by which those with a declared scale are as large as required.
+
+    Equations are weighted by the size of the readings.
+    """
+    model = filtered.model
+    if not _has_scaled_torques(model) or filtered.equations is None:
+        return filtered
+    factor = filtered.equations.declared_torque_scales()
+    columns = [factor[model.robot.joint_names.index(name)] for name in filtered.log.joint_names]
+    log = replace(filtered.log, joint_torque=np.asarray(filtered.log.joint_torque) * columns)
+    model = replace(model, reading_noise=factor * model.reading_noise, scale_std=SCALED_TORQUE_STD)
+    return FilteredLog(log, model, filtered.cutoff_hz)
+
+
+def _mistakes(filtered: FilteredLog, equations: ForceEquations, derived: tuple[str, ...]) -> Iterator[Finding]:
+    """The mistake that explains the forces best, of the file or the log, or that they contradict the URDF."""
+    if backward := list(_driving_friction(filtered, equations)):
+        yield from backward
         return
-    if fit.torque is not None and fit.torque.driving.any():  # which no lag, tilt or zero does
-        yield from torque_findings(robot, fit.torque)
-        return
-    log, samples = _scaled(log, samples, robot, fit.torque)
-    filtered = filtered if log is filtered.log else FilteredLog(log, model, cutoff)
-    if model.declared.delay == AUTO:
-        filtered = without_lag(filtered)
-        log = filtered.log
-    moved, unexplained = check_lag_and_tilt(filtered, derived)
-    moved = check_encoders(filtered, moved, unexplained)
-    scale = None if moved else _fit_time_scale(log, model)
-    if found := moved or [one for one in [_time_scale_finding(scale)] if one is not None]:
-        alike = None if moved else fit_torque_gains(samples, model)
-        yield from (alike and list(common_gain_findings(alike, robot))) or found
-        return
-    unexplained = unexplained if scale is None else min(unexplained, scale.recorded)
-    if fit.largest_misfit > MAX_MISFIT and unexplained > MAX_UNEXPLAINED_RATIO:
-        held = bool(model.contacts) or robot.fixed_base
-        gains = fit_torque_gains(samples, model) if held else None
-        found = list(gain_and_point_findings(log, gains, robot)) or single_zero_findings(filtered)
-        yield from found or [_contradiction(fit, robot, held)]
-        return
-    torques = [] if fit.torque is None else list(torque_findings(robot, fit.torque))
-    yield from torques
-    if not any(isinstance(item, Finding) for item in torques):
-        scaled = list(gain_and_point_findings(log, fit_torque_gains(samples, model), robot))
-        found = scaled or single_zero_findings(filtered) or list(check_torque_offsets(filtered))
-        yield from found or (common_factor_notes(filtered) if is_bolted_arm(model) else [])
+    filtered = _with_found_delay(filtered, derived)
+    equations = filtered.equations or equations
+    given = equations.unexplained
+    robot = filtered.model.robot
+    implausible = list(implausible_bodies(robot))
+    if implausible:
+        filtered = _without(implausible, filtered)
+        equations = filtered.equations or equations
+    is_contradicted = given > max(MIN_UNEXPLAINED, MIN_UNEXPLAINED_RATIO * equations.unexplained)
+    findings = list(_mistakes_of_log(filtered, equations, derived))
+    if not findings and equations.unexplained > MIN_CONTRADICTION:
+        is_contradicted = True
+        if not implausible:
+            yield _contradiction(given, filtered.model)
+    if implausible:
+        yield _inertials_finding(implausible, robot, SUSPICIOUS if is_contradicted else NOTE)
+    yield from findings
 
 
-def _explanation(filtered: FilteredLog, fit: ModelFit, derived: tuple[str, ...]) -> Finding | None:
-    """The one mistake that explains forces unlike the model's; gravity along other axes is nearly right."""
-    log, model = filtered.log, filtered.model
-    if (exchanged := check_exchanged_torques(filtered)) is not None:
-        return exchanged
-    if fit.largest_misfit <= MAX_MISFIT:
-        turned = _corrected_logs(filtered, accelerometer_axes(log, model.robot), derived)
-        return _mistake_beside_urdf(filtered, list(turned), least=0.0)
-    of_joints = joint_mistakes(log) if is_bolted_arm(model) else ()
-    possible = [x for x in (*possible_mistakes(log, model.robot), *of_joints) if _may_explain(x.field, fit)]
-    trials = list(_corrected_logs(filtered, possible, derived))
-    return _best_mistake(model, fit, trials) or _mistake_beside_urdf(filtered, trials)
+def _with_found_delay(filtered: FilteredLog, derived: tuple[str, ...]) -> FilteredLog:
+    """The log without the delay of its torques, where a fit is to find it and it explains the forces best."""
+    best = best_explanation(filtered, derived) if filtered.model.declared.delay == AUTO else None
+    if best is None or (best.findings[0].name, best.findings[0].field) != ("delay", "joint_torque"):
+        return filtered
+    return replace(filtered, log=with_delayed_torques(filtered.log, -float(best.value[0])))
 
 
-def _is_mostly_friction(stated: ModelFit, without: ModelFit) -> bool:
-    """Whether most of what torques differ by is friction that the robot's file states, whatever else is wrong."""
-    if stated.torque is None or without.torque is None:
-        return False
-    return (
-        without.torque.misfit * without.torque.size
-        < MAX_FORCE_RESIDUAL_SHARE * stated.torque.misfit * stated.torque.size
+def _mistakes_of_log(filtered: FilteredLog, equations: ForceEquations, derived: tuple[str, ...]) -> Iterator[Finding]:
+    """The mistake of the log that explains the forces best."""
+    best = best_explanation(filtered, derived)
+    least = equations.unexplained if best is None else best.left
+    if least > MIN_UNEXPLAINED:
+        usual = _usual_mistake(filtered, equations, derived), _time_scale(filtered.log, filtered.model)
+        better = [trial for trial in usual if trial is not None and trial.left * MIN_UNEXPLAINED_RATIO < least]
+        best = min(better, key=lambda trial: trial.left, default=best)
+    yield from _dead_encoders(filtered, equations) if best is None else best.findings
+
+
+@dataclass(frozen=True)
+class ImplausibleBody:
+    """A body with a mass or an inertia that no body of a robot has.
+
+    Attributes:
+        number: of the body.
+        fault: what is wrong.
+        of_mass: whether that may be the mass; else it is the inertia.
+    """
+
+    number: int
+    fault: str
+    of_mass: bool = True
+
+
+def implausible_bodies(robot: Robot) -> Iterator[ImplausibleBody]:
+    """Bodies with a mass or an inertia that no body of a robot has, by the robot's file alone."""
+    mass = robot.nominal[:, parameters.MASS]
+    total = float(np.abs(mass).sum())
+    length = reach(robot)
+    bodies = [number for number, body in enumerate(robot.bodies) if not body.massless]
+    moments = {number: np.linalg.eigvalsh(parameters.mass_com_inertia(robot.nominal[number])[2]) for number in bodies}
+    isotropic = Counter(f"{x[0]:.4g}" for x in moments.values() if np.ptp(x) < _EQUAL_MOMENTS * x[-1])
+    for number, (least, _, largest) in moments.items():
+        trace = float(moments[number].sum())
+        if mass[number] <= 0.0:
+            yield ImplausibleBody(number, f"a mass of {mass[number]:.3g} kg")
+        elif mass[number] < _MIN_MASS_SHARE * total:
+            continue
+        elif largest > _MAX_MOMENT_SHARE * trace or least < 0.0:
+            fault = "one moment of inertia larger than the sum of the two others, or negative"
+            yield ImplausibleBody(number, fault, of_mass=False)
+        elif (radius := np.sqrt(0.5 * trace / mass[number])) > length > 0.0:
+            yield ImplausibleBody(number, f"a radius of gyration of {radius:.2g} m, beyond the robot's {length:.2g} m")
+        elif not _MIN_DENSITY < (density := mass[number] / (_BALL_VOLUME * max(radius, _TINY) ** 3)) < _MAX_DENSITY:
+            yield ImplausibleBody(number, f"a density of {density:.2g} kg/m^3 if it is a ball")
+        elif 2 * isotropic[f"{least:.4g}"] > max(len(bodies), _MIN_BODIES):
+            fault = f"moments of inertia of {least:.3g} kg m^2 about all axes, as most bodies"
+            yield ImplausibleBody(number, fault, of_mass=False)
+
+
+def _inertials_finding(bodies: Sequence[ImplausibleBody], robot: Robot, severity: str) -> Finding:
+    """A finding about the robot's file alone, which forces contradict if it is more than a note."""
+    names = [robot.bodies[body.number].name for body in bodies]
+    named = join_names([f"{name} has {body.fault}" for name, body in zip(names, bodies, strict=True)], _NAMED)
+    contradicted = "" if severity == NOTE else "forces contradict it, and "
+    advice = f"correct masses and inertias of these links in the {robot.format}: look for a lost decimal point"
+    text = f"{contradicted}the {robot.format} is implausible: {named}"
+    return Finding("inertials", severity, "robot", text, advice, tuple(names))
+
+
+def _without(bodies: Sequence[ImplausibleBody], filtered: FilteredLog) -> FilteredLog:
+    """The log beside a robot of whose implausible bodies the file tells nothing."""
+    unknown = np.zeros(filtered.model.robot.nominal.shape, bool)
+    for body in bodies:
+        unknown[body.number, parameters.INERTIAL if body.of_mass else parameters.INERTIA] = True
+    return replace(filtered, model=replace(filtered.model, unknown=unknown))
+
+
+def _contradiction(unexplained: float, model: NominalModel) -> Finding:
+    """A finding about forces that no usual mistake explains."""
+    file = model.robot.format
+    text = (
+        f"no {file} near the given one explains {format_percent(UNMODELLED_FORCE_SHARE * unexplained)} % of the forces"
     )
-
-
-def _contradiction(fit: ModelFit, robot: Robot, held: bool) -> Finding:
-    """A finding about forces that no usual mistake explains; `held`: whether anything is known to hold the robot."""
-    text = f"measured forces differ from the {robot.format}'s by {_percent(fit.largest_misfit)}{UNEXPLAINED}"
-    advice = f"check units, frames, the order of joints and contacts, friction, the {robot.format}'s base link and"
-    advice += f" masses, and whether the {robot.format} is that of this robot"
-    if not held:
+    advice = f"check units, frames, the order of joints and contacts, friction, the {file}'s base link and masses, and"
+    advice += f" whether the {file} is that of this robot"
+    if not model.contacts and not model.robot.fixed_base:
         advice = f"name under contacts what touches the ground, or holds the base in the air; or {advice}"
-    return Finding("forces", SUSPICIOUS, "all", text, advice)
+    return Finding("forces", SUSPICIOUS, "all", text + UNEXPLAINED, advice)
 
 
-def _scaled(log: Log, samples: Sequence[Samples], robot: Robot, fit: TorqueFit | None) -> tuple[Log, Sequence[Samples]]:
-    """A log and samples of it, of torques times the declared unknown scales that fit best."""
-    if fit is None or log.joint_torque is None or (fit.scale == 1.0).all():
-        return log, samples
-    by_name = dict(zip((robot.joint_names[joint] for joint in fit.joints), fit.scale, strict=True))
-    factor = np.array([by_name.get(name, 1.0) for name in log.joint_names])
-    of_dofs = torch.tensor([by_name.get(name, 1.0) for name in robot.dof_names])
-    scaled = [replace(x, torque=None if x.torque is None else x.torque * of_dofs) for x in samples]
-    return replace(log, joint_torque=log.joint_torque * factor), scaled
-
-
-def _friction_finding(robot: Robot, stated: ModelFit, without: ModelFit) -> Finding:
-    """Friction in the robot's file that the forces contradict, and nothing else; the largest of each kind is named."""
-    largest = []
-    for number, kind in ((COULOMB, "Coulomb"), (VISCOUS, "viscous")):
-        body = robot.bodies[int(np.argmax(np.abs(robot.nominal[:, number])))]
-        if (value := robot.nominal[robot.bodies.index(body), number]) and body.joint is not None:
-            largest.append(f"{kind} up to {value:g} in {body.joint.name}")
-    text = f"measured forces differ from the {robot.format}'s by {_percent(stated.largest_misfit)}"
-    if without.largest_misfit <= MAX_MISFIT:
-        text += f", by {_percent(without.largest_misfit)} without the friction that it states"
-    else:
-        text += ", mostly by the friction that it states"
-    text += f": {', '.join(largest)}"
-    return Finding("friction", NOTE, "all", text, f"nothing, as a fit finds friction; or 0 in the {robot.format}")
-
-
-@dataclass(frozen=True, eq=False)
-class _Corrected:
-    """A usual mistake, and some samples of the log without it."""
-
-    mistake: Mistake
-    samples: Sequence[Samples]
-
-
-def _corrected_logs(whole: FilteredLog, mistakes: Iterable[Mistake], derived: tuple[str, ...]) -> Iterator[_Corrected]:
-    """The log without each of some mistakes, where the filter accepts it then."""
-    log, model, cutoff = whole.log, whole.model, whole.cutoff_hz
-    for mistake in mistakes:
-        if mistake.field.startswith(derived):
+def _usual_mistake(filtered: FilteredLog, equations: ForceEquations, derived: tuple[str, ...]) -> Explanation | None:
+    """The usual mistake of the motion without which a URDF near the given one explains the forces much better."""
+    log = filtered.log
+    model = filtered.model
+    unexplained = equations.unexplained
+    of_joints: Iterable[Mistake] = joint_mistakes(log) if model.is_bolted_arm else ()
+    trials = list[tuple[float, Mistake]]()
+    for mistake in (*possible_mistakes(log, model.robot), *of_joints):
+        if mistake.field.startswith(derived or ("-",)) or mistake.field in READINGS:
             continue
         try:
-            if mistake.after_filter:
-                pieces = [mistake.correct(piece) for piece in whole.pieces]
-            else:
-                pieces = preprocess_pieces(mistake.correct(log), cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
-            yield _Corrected(mistake, bind_some_samples(pieces, model.robot, model.contacts, TRIAL_SAMPLES))
-        except InputError:
+            corrected = _corrected(mistake, filtered, equations)
+        except InputError:  # the filter does not accept it then
             continue
-
-
-def _best_mistake(model: NominalModel, fit: ModelFit, trials: Sequence[_Corrected]) -> Finding | None:
-    """The mistake whose correction leaves the least misfit, if that is small enough: one of torques, by the torques."""
-    robot, best, least, shares = model.robot, None, min(fit.misfit, 1.0), (0.0, 0.0)
-    for one in trials:
-        mistake, of_torques = one.mistake, one.mistake.field == "joint_torque"
-        trial = model.compare(
-            one.samples, least if of_torques else min(least, MAX_FORCE_RESIDUAL_SHARE * min(fit.misfit, 1.0))
-        )
-        if trial.compared != fit.compared or (of_torques and trial.implausible > fit.implausible):
-            continue  # compare the same forces only
-        if of_torques and trial.mostly_implausible:
-            continue  # corrected one by one they fit after any factor
-        if mistake.of_joint and trial.reversed:
-            continue  # the torque tells which way its joint turns
-        before, after = (x.torque_misfit or 0.0 if of_torques else x.misfit for x in (fit, trial))
-        if after < MAX_FORCE_RESIDUAL_SHARE * min(before, 1.0) and trial.misfit < least:
-            best, least, shares = mistake, trial.misfit, (before, after)
-    if best is None:
+        if corrected is not None:
+            trials.append((corrected.unexplained, mistake))
+    trials.sort(key=lambda trial: trial[0])
+    if not trials or trials[0][0] > min(MAX_LEFT, MAX_CORRECTED_SHARE * unexplained):
         return None
-    before, after = shares
-    measured = "torques" if best.field == "joint_torque" else "forces"
-    text = f"measured {measured} differ from the {robot.format}'s by {_percent(before)}"
-    text += f", by {_percent(after)} once corrected"
-    of_currents = best.field == "joint_torque" and best.description.startswith("in ") and after > _MAX_UNIT_MISFIT
-    advice = best.advice + "; of currents, set sensors.scales: {joint_torque: all}" * of_currents
-    advice += f"; or is {robot.path.name} another robot's?" * (after > MAX_CLEAR_MISFIT)
-    return Finding("unit, sign or frame", REJECTED, best.field, f"{best.description}: {text}", advice)
-
-
-def _mistake_beside_urdf(
-    filtered: FilteredLog, trials: Sequence[_Corrected], least: float = MAX_UNEXPLAINED_RATIO
-) -> Finding | None:
-    """The mistake without which a URDF near the given one explains the forces.
-
-    The misfit of the given one does not show it where small forces are far off without any mistake: moments about a
-    base that stands or flies upright are those of a centre of mass that is 1 cm off.
-    """
-    rows, model = filtered.rows, filtered.model
-    if not trials or rows is None or rows.unexplained <= least:
-        return None
-    corrected = ((DeviationRows.of(one.samples, model), one.mistake) for one in trials)
-    left = sorted(((x.unexplained, one) for x, one in corrected if x is not None), key=lambda pair: pair[0])
-    if not left or left[0][0] > min(MAX_LEFT, MAX_FORCE_RESIDUAL_SHARE * rows.unexplained):
-        return None
-    of_best, best = left[0]
-    ratio = rows.unexplained / max(of_best, _TINY)
+    left, best = trials[0]
+    ratio = unexplained / max(left, 1e-9)
     text = f"{best.description}: {ratio:.2g} times as much of the forces is unexplained as once corrected"
-    for other_left, other in left[1:]:
-        if other_left < MIN_UNEXPLAINED_RATIO * of_best and other.description != best.description:
+    for other_left, other in trials[1:]:
+        if other_left < _ALIKE_RATIO * left and other.description != best.description:
             text += f"; or {other.field} {other.description}, which explains as much"
-    return Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
+    finding = Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
+    return Explanation([finding], left, 1, np.zeros(0))
 
 
-def _may_explain(field: str, fit: ModelFit) -> bool:
-    """Whether a field can cause the misfit: torques and wrenches only their own, positions and base motion both."""
-    misfits = {"joint_torque": fit.torque_misfit, **dict.fromkeys(WRENCHES, fit.wrench_misfit)}
-    if field in misfits:
-        return (misfits[field] or 0.0) > MAX_MISFIT
-    return all(misfit is None or misfit > MAX_MISFIT for misfit in misfits.values())
+def _corrected(mistake: Mistake, filtered: FilteredLog, equations: ForceEquations) -> ForceEquations | None:
+    """Equations of some samples of the log without a mistake."""
+    if _has_scaled_torques(filtered.model):
+        corrected = FilteredLog(mistake.correct(filtered.log), filtered.model, filtered.cutoff_hz)
+        return _with_declared_scales(corrected).equations
+    if mistake.after_filter:
+        pieces = [mistake.correct(piece) for piece in filtered.pieces]
+    else:
+        pieces = preprocess_pieces(mistake.correct(filtered.log), filtered.cutoff_hz)
+    return equations_of(pieces, filtered.model, TRIAL_SAMPLES, equations.builder)
 
 
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.3g} %" if share < 10.0 else f"{share:.3g} times their size"
+def _driving_friction(filtered: FilteredLog, equations: ForceEquations) -> Iterator[Finding]:
+    """Findings about joints of a bolted arm most of whose torque is friction that would drive them."""
+    robot = filtered.model.robot
+    samples = equations.samples
+    readings = equations.samples.torque
+    if not filtered.model.is_bolted_arm or readings is None:
+        return
+    for joint, name in enumerate(robot.joint_names):
+        torque = readings[:, joint].numpy()
+        velocity = samples.joint_velocity[:, joint].numpy()
+        if not equations.builder.sensors.torque[joint] or not velocity.any():
+            continue
+        terms = np.stack([np.sign(velocity), velocity, equations.required[:, joint], np.ones_like(torque)], axis=1)
+        size = np.maximum(np.linalg.norm(terms, axis=0), 1e-12)
+        parts = terms / size * np.linalg.lstsq(terms / size, torque, rcond=None)[0]
+        friction = parts[:, :2].sum(axis=1)
+        load = parts[:, 2:].sum(axis=1)
+        others = np.linalg.norm(load) + np.linalg.norm(torque - friction - load)
+        if friction @ velocity < 0.0 and np.linalg.norm(friction) > _MIN_FRICTION_RATIO * others:
+            text = f"{name}: reversed: most of it is friction, which would drive the joint"
+            advice = "reverse these torques; or positions and velocities, if these are"
+            yield Finding("sign", REJECTED, "joint_torque", text, advice, (name,))
 
 
-def _fit_time_scale(log: Log, model: NominalModel) -> TimeScale | None:
-    """The scale of time by the forces; None where nothing moves, or the log is too short."""
-    cutoff = motion_cutoff_hz(log)
+def _dead_encoders(filtered: FilteredLog, equations: ForceEquations) -> Iterator[Finding]:
+    """Joints that stand still with a torque that no joint at rest needs; a note where friction may hold them."""
+    robot = filtered.model.robot
+    readings = equations.samples.torque
+    still = still_joints(filtered.log)
+    if not still or readings is None or equations.unexplained < MIN_UNEXPLAINED:
+        return
+    residuals = equations.residuals()
+    rows = equations.W[:, equations.builder.tree.base_rows :][:, : robot.n]
+    along = np.einsum("njr,nr->nj", rows, residuals)
+    size = np.square(rows).sum(axis=2)
+    made_up = np.square(along) / np.where(size > 0.0, size, np.inf)
+    error = np.sqrt(np.square(along / np.where(size > 0.0, size, np.inf)).mean(axis=0))
+    share = made_up.sum(axis=0) / np.square(residuals).sum()
+    load = np.sqrt(np.square(np.nan_to_num(readings[:, : robot.n].numpy())).mean(axis=0))
+    for name in still:
+        joint = robot.joint_names.index(name) if name in robot.joint_names else -1
+        if joint < 0 or share[joint] < _MIN_DEAD_SHARE:
+            continue
+        unit = "N" if name in robot.sliding else "N m"
+        text = f"{name} stands still, with {error[joint]:.2g} {unit} rms that a joint at rest does not need"
+        held = error[joint] < MAX_FRICTION_SHARE * float(load.max())
+        advice = "none if friction or a brake holds it; else " * bool(held)
+        advice += "look whether it moves, for a dead encoder, and leave the log out"
+        yield Finding("dead encoder", NOTE if held else SUSPICIOUS, "joint_position", text, advice, (name,))
+
+
+# -------------------------------------------------------------------------------------------------------- unit of time
+
+
+def motion_cutoff_hz(log: Log) -> float | None:
+    """A cutoff [Hz] from the spectrum of the joint positions, for any unit of time; None where no joint moves."""
+    position = log.joint_position[: 2 * (len(log) // 2)]
+    window = np.hanning(len(position))[:, None]  # a log that ends elsewhere than it began has no jump between
+    power = np.square(np.abs(np.fft.rfft(window * (position - position.mean(axis=0)), axis=0))).sum(axis=1)
+    power[0] = 0.0
+    if not power.sum() > 0.0:
+        return None
+    last = int(np.searchsorted(np.cumsum(power), _MOTION_POWER_SHARE * power.sum()))
+    step = median_step(log)
+    lowest = max(_CUTOFF_BANDWIDTHS * last, _MIN_CUTOFF_PERIODS) / (step * len(position))
+    return float(min(lowest, _MAX_CUTOFF_RATE_SHARE / step))
+
+
+def _time_scale(log: Log, model: NominalModel) -> Explanation | None:
+    """Time in another unit: gravity and inertia explain the forces in that unit only.
+
+    Velocities and accelerations scale with the inverse of time and its square, gravity is constant: three factors
+    determine the forces at all others. Noise of positions makes accelerations without forces, as stamps that are too
+    dense do: the corrected time must also explain the forces better than a robot at rest.
+    """
+    cutoff_hz = motion_cutoff_hz(log)
+    model = replace(model, scale_std=DECLARED_SCALE)
+    if cutoff_hz is None:
+        return None
+
+    def samples_at(factor: float) -> Samples:
+        scaled = replace(log, time=log.time[0] + factor * (log.time - log.time[0]))
+        return bind_some_samples(preprocess_pieces(scaled, cutoff_hz / factor), model.robot, model.contacts)
+
     try:
-        return None if cutoff is None else fit_time_scale(log, model, cutoff)
+        recorded = samples_at(1.0)
+        doubled = samples_at(2.0)
+        at_rest = samples_at(_REST_FACTOR)
+        equations = ForceEquations.of(at_rest, model)
     except InputError:
         return None
-
-
-def _time_scale_finding(scale: TimeScale | None) -> Finding | None:
-    """Time is in another unit: gravity and inertia explain the forces in that unit only.
-
-    Noise of positions makes accelerations without forces, as time stamps that are too dense do. The corrected time
-    must therefore also explain the forces better than a robot at rest. Gravity and inertia that do not make up the
-    forces in any time are those of another robot or load, whose inertias a factor of time makes up in part.
-    """
-    if scale is None:
+    if equations is None:
         return None
-    factor, log_factor = scale.factor, np.log(scale.factor)
-    agree = np.log(scale.blocks) * np.sign(log_factor) > MIN_BLOCK_SHARE * abs(log_factor)
-    improves = min(scale.recorded, scale.at_rest) >= _MIN_UNEXPLAINED_RATIO_OF_TIME * scale.corrected
-    makes_up = scale.corrected <= MAX_UNEXPLAINED_RATIO
-    makes_up |= scale.recorded >= _MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT * scale.corrected
-    if abs(log_factor) < np.log(MIN_TIME_FACTOR) or not agree.all() or not improves or not makes_up:
+    gravity = equations.required
+    total = equations.required_of(recorded)
+    slower = equations.required_of(doubled)
+    quadratic = 2.0 * (total - gravity) - 4.0 * (slower - gravity)
+    products = equations.reduced(np.stack([total - gravity - quadratic, quadratic], axis=2)).products
+    u = np.stack([np.ones_like(_TIME_FACTORS), 1.0 / _TIME_FACTORS, 1.0 / _TIME_FACTORS**2])
+    cost = np.einsum("ks,bkl,ls->bs", u, products, u)
+    best = int(np.argmin(cost[0]))
+    unity = int(np.argmin(np.abs(np.log(_TIME_FACTORS))))
+    left = np.sqrt(np.maximum(cost[0], 0.0) / max(equations.rows, 1))
+    factor = float(_TIME_FACTORS[best])
+    blocks = _TIME_FACTORS[np.argmin(cost[1:], axis=1)]
+    agree = np.log(blocks) * np.sign(np.log(factor)) > MIN_BLOCK_SHARE * abs(np.log(factor))
+    ratio = min(left[unity], left[-1]) / max(left[best], 1e-9)
+    makes_up = left[best] <= _MAX_LEFT_BY_TIME or left[unity] >= _MIN_TIME_RATIO_OF_ANOTHER_ROBOT * left[best]
+    if abs(np.log(factor)) < np.log(MIN_TIME_FACTOR) or not agree.all() or ratio < _MIN_TIME_RATIO or not makes_up:
         return None
-    units = [name for size, name in TIME_UNIT_FACTORS.items() if abs(factor / size - 1.0) < _TIME_UNIT_TOLERANCE]
-    prefix = f"in {units[0]}: " if units else ""
-    text = f"{prefix}gravity and inertia make up the measured forces if time is multiplied by {factor:.3g}"
+    units = [name for size, name in _TIME_UNITS.items() if abs(factor / size - 1.0) < 0.1]
+    text = f"gravity and inertia make up the measured forces if time is multiplied by {factor:.3g}"
     advice = "give seconds; check the sample rate that the stamps were made from"
-    return Finding("unit", REJECTED, "time", text, advice)
+    finding = Finding("unit", REJECTED, "time", f"in {units[0]}: {text}" if units else text, advice)
+    return Explanation([finding], float(left[best]), 1, np.array([factor]))

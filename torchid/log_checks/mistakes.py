@@ -19,7 +19,6 @@ from torchid.logs import Log
 from torchid.logs.log import WRENCHES, FloatArray
 from torchid.logs.quaternion import inverse_rotation, make_sign_continuous, rotate_to_base
 from torchid.logs.units import advise_units, other_units
-from torchid.parameters import GRAVITY
 from torchid.robot import Robot
 
 #: Parts of names that differ between left and right, and between front and rear.
@@ -142,12 +141,6 @@ def other_orders(names: Sequence[str], robot: Robot | None) -> Iterator[tuple[st
                 yield f"columns in {description}" + f" with {exchanged}" * bool(exchanged), permuted
 
 
-def joints_of_limb(robot: Robot, frame: str) -> list[str]:
-    """The joints between the base and a link, from the base on."""
-    joints = (robot.bodies[body].joint for body in robot.bodies_to(robot.links[frame][0]))
-    return [joint.name for joint in joints if joint is not None]
-
-
 def exchanged_pairs(names: Sequence[str], some: Collection[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """The names with any two exchanged, one of them at least among `some`."""
     for one, other in itertools.combinations(names, 2):
@@ -243,9 +236,6 @@ def possible_mistakes(log: Log, robot: Robot | None = None) -> Iterator[Mistake]
         )
         yield from accelerometer_axes(log, robot)
     if log.joint_torque is not None:
-        reverse = "reverse them; a base that hangs upside down looks the same (give base_quat)"
-        yield Mistake("joint_torque", "all reversed", reverse, _multiply("joint_torque", -1.0), True)
-        yield from _unit_mistakes("joint_torque", "torque", after_filter=True)
         for description, permuted in other_orders(log.joint_names, robot):  # of limbs, or of drives
             order = [permuted.index(name) for name in log.joint_names]
             advice = "give torques in the order of joint_names, as positions"
@@ -398,10 +388,6 @@ def _turn_wrench(field: str, R: NDArray[np.float64]) -> Callable[[Log], Log]:
 
 
 def _wrench_mistakes(field: str, other: str) -> Iterator[Mistake]:
-    reverse = "reverse it: wrenches are what the ground exerts on the robot"
-    yield Mistake(field, "all reversed", reverse, _multiply(field, -1.0), True)
-    for unit, factor in (("kN and kN m", 1e3), ("kg", GRAVITY), ("mN and mN m", 1e-3)):
-        yield Mistake(field, f"in {unit}", f"multiply by {factor:g}", _multiply(field, factor), True)
     moments = _change(lambda log: {field: getattr(log, field) * _MILLI_MOMENT_FACTORS})
     yield Mistake(field, "moments in N mm", "multiply moments by 0.001", moments, True)
     opposite = _change(lambda log: {field: getattr(log, field) * _OPPOSITE_MOMENTS})

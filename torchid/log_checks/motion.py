@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,9 +21,11 @@ from torchid.logs.quaternion import (
     rotate_to_base,
     rotate_to_world,
 )
+from torchid.logs.signal_noise import rough_noise
 from torchid.logs.units import UNIT_TOLERANCE, advise_units, describe_units, units_of_derivative_ratio
 from torchid.parameters import GRAVITY
 from torchid.problem.log_joints import loop_gaps, with_loop_joints
+from torchid.problem.motion import MIN_MOTION
 from torchid.robot import Robot
 from torchid.rounding import STD_PER_MAD
 
@@ -378,3 +380,82 @@ def check_loops(log: Log, robot: Robot | None) -> Iterator[Finding]:
         else:
             text = f"{gap.loop.label} are together up to {gap}"
             yield Finding("closed loop", NOTE, "joint_position", text, f"nothing: accepted is {gap.accepted}")
+
+
+# ------------------------------------------------------------------------------------------------------ poses and rest
+
+LinkPoses = dict[str, torch.Tensor]
+"""Poses (N, 4, 4) in the base of the robot's links, by name."""
+
+
+def recorded_link_poses(log: Log, robot: Robot) -> LinkPoses:
+    """Poses of the links at the samples of a log of all the robot's joints."""
+    order = [log.joint_names.index(name) for name in robot.joint_names]
+    return robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+
+
+def same_poses(log: Log, other: Log, robot: Robot, links: Sequence[str]) -> bool:
+    """Whether some links have the same poses in the base in two logs: joints beside or beyond them do not count."""
+    if log.joint_position is other.joint_position and log.joint_names == other.joint_names:
+        return True
+    moved = {body - 1 for link in links if link in robot.links for body in robot.bodies_to(robot.links[link][0])}
+    joints = np.unique(np.nonzero(robot.joint_map[0][sorted(moved)])[1])  # those that others follow among them
+    names = [robot.joint_names[joint] for joint in joints]
+    if not set(names) <= set(log.joint_names) & set(other.joint_names):
+        return False
+    own, theirs = (x.joint_position[:, [x.joint_names.index(name) for name in names]] for x in (log, other))
+    return np.array_equal(own, theirs)
+
+
+#: Time over which positions are averaged, and velocities added up: a tenth of a second resolves motion up to 5 Hz.
+_AVERAGED_S = 0.1
+#: Largest range of averages of white noise, in their standard deviations, in a thousand of them.
+_NOISE_RANGE = 8.0
+#: Travel by a joint's velocity over its noise, and over that of its position, from which on it moves.
+_MIN_TRAVEL_TO_NOISE, _MIN_TRAVEL_RATIO = 20.0, 10.0
+
+
+def still_joints(log: Log) -> tuple[str, ...]:
+    """Joints whose positions never move beyond their noise, while others do."""
+    position = log.joint_position
+    if len(log) < 2 or not position.size or np.ptp(position, axis=0).max() <= MIN_MOTION:
+        return ()
+    count = max(1, round(_AVERAGED_S / float(np.median(np.diff(log.time)))))
+    whole = count * (len(log) // count)
+    if whole < 2 * count:
+        return ()
+    averages = position[:whole].reshape(-1, count, position.shape[1]).mean(axis=1)
+    noise = rough_noise(position) / np.sqrt(count)
+    still = np.ptp(averages, axis=0) <= np.minimum(_NOISE_RANGE * noise, MIN_MOTION)
+    return tuple(name for name, rests in zip(log.joint_names, still, strict=True) if rests)
+
+
+def check_still_velocities(log: Log) -> Iterator[Finding]:
+    """A finding about joints whose velocities move them while their positions stand still."""
+    names, velocity = still_joints(log), log.joint_velocity
+    if not names or velocity is None:
+        return
+    step = float(np.median(np.diff(log.time)))
+    lag = max(1, round(_AVERAGED_S / step))
+    travelled = step * np.cumsum(velocity, axis=0)
+    moved, read = (x[lag:] - x[:-lag] for x in (travelled, log.joint_position))
+    size, still = (np.std(x, axis=0) for x in (moved, read))
+    least = np.maximum(_MIN_TRAVEL_TO_NOISE * step * np.sqrt(lag) * rough_noise(velocity), _MIN_TRAVEL_RATIO * still)
+    dead = [name for name in names if size[(j := log.joint_names.index(name))] > max(least[j], 1e-9)]
+    if dead:
+        ranges = [f"{name} {np.ptp(travelled[:, log.joint_names.index(name)]):.2g}" for name in dead]
+        text = f"positions stand still while velocities move these joints by (rad, slides: m) {join_names(ranges)}"
+        advice = "look whether these joints move, for a dead encoder, and leave the log out"
+        yield Finding("dead encoder", SUSPICIOUS, "joint_position", text, advice, tuple(dead))
+
+
+def joints_of_limb(robot: Robot, frame: str) -> list[str]:
+    """The joints between the base and a link, from the base on."""
+    joints = (robot.bodies[body].joint for body in robot.bodies_to(robot.links[frame][0]))
+    return [joint.name for joint in joints if joint is not None]
+
+
+def still_in_limb(log: Log, robot: Robot, frame: str) -> list[str]:
+    """The joints between the base and a link that stand still in the log."""
+    still = still_joints(log)
+    return [name for name in joints_of_limb(robot, frame) if name in still]

@@ -11,7 +11,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
 from torchid.errors import format_percent, join_names
-from torchid.log_checks.encoders import still_in_limb
 from torchid.log_checks.findings import (
     REJECTED,
     SUSPICIOUS,
@@ -21,8 +20,8 @@ from torchid.log_checks.findings import (
     find_spans,
     median_step,
 )
-from torchid.log_checks.mistakes import Mistake, exchanged_joints, joints_of_limb, possible_mistakes, reversed_joints
-from torchid.log_checks.model import LinkPoses, recorded_link_poses, same_poses
+from torchid.log_checks.mistakes import Mistake, exchanged_joints, possible_mistakes, reversed_joints
+from torchid.log_checks.motion import LinkPoses, joints_of_limb, recorded_link_poses, same_poses, still_in_limb
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.quaternion import rotate_to_world

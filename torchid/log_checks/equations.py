@@ -1,0 +1,525 @@
+"""What the forces of a log say beside every URDF near the given one: equations, and unknowns estimated in them."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchid import parameters
+from torchid.errors import TorchidWarning
+from torchid.log_checks.findings import median_step
+from torchid.logs import Log
+from torchid.logs.cutoff import usual_cutoff_hz
+from torchid.logs.log import BoolArray, FloatArray, SignalNoise
+from torchid.logs.preprocess import preprocess
+from torchid.logs.signal_noise import rough_noise
+from torchid.parallel import one_thread
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
+from torchid.problem.chunks import chunks_by_state
+from torchid.problem.linear import parameter_scale
+from torchid.problem.metrics import force_series
+from torchid.problem.samples import concatenate
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorNoise, SensorSet
+
+#: Forces that no parameters explain (flexibility, filters, shape of friction), over the rms of each kind of force.
+UNMODELLED_FORCE_SHARE = 0.05
+#: Errors of a URDF, in units of `parameter_scale`: 0.1 is a mass, or an inertia, that is 15 to 20 % off.
+URDF_ERROR = 0.1
+#: Prior of torques that the URDF lacks, over the unmodelled force: friction, by sign and velocity, and a constant.
+JOINT_TERM_SCALE = 3.0
+#: The same of armature: a geared motor's inertia may be all of the torque in light limbs.
+ARMATURE_SCALE = 1.0 / UNMODELLED_FORCE_SHARE
+#: Prior of declared terms, over their usual size; of declared scales; of those of torques as large as required.
+DECLARED_SIZES, DECLARED_SCALE, SCALED_TORQUE_STD = 10.0, 10.0, 0.3
+#: Successive samples that count as one: of 240 out of ten seconds, errors of friction and flexibility are correlated.
+CORRELATED_SAMPLES = 10.0
+#: Samples of a log whose forces are compared, and blocks of time whose estimates must agree.
+COMPARED_SAMPLES, TIME_BLOCKS = 240, 6
+#: Share of an estimate that every block of time must show, and its least size in standard deviations: by chance alone
+#: one in 2000 is larger, or one in a hundred logs of twenty unknowns.
+MIN_BLOCK_SHARE, MIN_STANDARD_DEVIATIONS = 0.5, 3.5
+#: Samples that are differentiated: all of a short log, `PIECES` evenly spread runs of a long one.
+MAX_DIFFERENTIATED_SAMPLES, PIECES = 10_000, 4
+#: Torque below the resolution of any sensor.
+MIN_TORQUE_NM = 1e-9
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Declared:
+    """What an experiment says of its sensors and actuators, for which no log is to blame.
+
+    Attributes:
+        noise: standard deviations of the readings, NaN where none is stated; None: nowhere.
+        terms: extra parameters that are fitted, as offsets and scales of sensors.
+        delay: how much later than recorded joint torques act [s]; `AUTO`: to be found.
+        finds_tilt: whether the tilt of the base is to be found.
+        goes_on_without_base: whether a fit goes on where the base is lost.
+    """
+
+    noise: SensorNoise | None = None
+    terms: ExtraTerms = dataclasses.field(default_factory=ExtraTerms)
+    delay: float | str = 0.0
+    finds_tilt: bool = False
+    goes_on_without_base: bool = False
+
+    @property
+    def known_delay(self) -> float:
+        """The delay [s], 0 where it is to be found."""
+        return 0.0 if isinstance(self.delay, str) else self.delay
+
+
+@dataclass(frozen=True, eq=False)
+class NominalModel:
+    """A robot as its file has it, its contacts, and what is declared of its sensors.
+
+    Attributes:
+        robot: the robot.
+        contacts: of it.
+        declared: what is known of its sensors.
+        reading_noise: of the torques of its joints from sample to sample, (n,) [N m or N].
+        scale_std: standard deviation of the prior of declared scales.
+        torque_ratio: size of the torques that act over that of their readings.
+        unknown: inertial parameters, (L, 12), that the file does not tell.
+    """
+
+    robot: Robot
+    contacts: Sequence[Contact]
+    declared: Declared = dataclasses.field(default_factory=Declared)
+    reading_noise: FloatArray | float = 0.0
+    scale_std: float = DECLARED_SCALE
+    torque_ratio: float = 1.0
+    unknown: BoolArray | None = None
+
+    @cached_property
+    def phi(self) -> FloatArray:
+        """Parameters (1, 12 L) without friction: of that, files state anything."""
+        nominal = self.robot.nominal.copy()
+        nominal[:, parameters.FRICTION] = 0.0
+        if self.unknown is not None:
+            nominal[self.unknown] = 0.0
+        return nominal.flatten()[None]
+
+    @property
+    def is_bolted_arm(self) -> bool:
+        """Whether torques are those of joints, of gravity and inertia alone."""
+        return self.robot.fixed_base and not self.contacts and not self.robot.loops
+
+
+@dataclass(frozen=True, eq=False)
+class FilteredLog:
+    """Some filtered samples of a log, with their equations.
+
+    Attributes:
+        log: as it was read.
+        model: robot, contacts, and what is declared.
+        cutoff_hz: of the filter.
+    """
+
+    log: Log
+    model: NominalModel
+    cutoff_hz: float
+
+    @cached_property
+    def pieces(self) -> list[Log]:
+        """Runs of the log, filtered. Raises InputError: it cannot be filtered."""
+        return preprocess_pieces(self.log, self.cutoff_hz)
+
+    @cached_property
+    def equations(self) -> ForceEquations | None:
+        """None where no force was measured. Raises InputError: as `pieces`, or the log does not match the robot."""
+        return equations_of(self.pieces, self.model)
+
+
+def default_cutoff_hz(log: Log) -> float:
+    """The cutoff [Hz] where the user gives none."""
+    return usual_cutoff_hz(1.0 / median_step(log))
+
+
+def preprocess_pieces(log: Log, cutoff_hz: float, max_samples: int = MAX_DIFFERENTIATED_SAMPLES) -> list[Log]:
+    """The log with velocities and accelerations; of one longer than `max_samples`, evenly spread runs of samples.
+
+    Raises:
+        InputError: the log cannot be filtered.
+    """
+    count = 1 if len(log) <= max_samples else PIECES
+    length = min(len(log), max_samples) // count
+    starts = np.linspace(0, len(log) - length, count).astype(int)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)  # other findings report these
+        pieces = [replace(log.select(slice(start, start + length)), motion_noise=SignalNoise({})) for start in starts]
+        return [preprocess(piece, cutoff_hz) for piece in pieces]
+
+
+def bind_some_samples(
+    logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED_SAMPLES
+) -> Samples:
+    """About `count` evenly spread samples of filtered runs of a log.
+
+    Raises:
+        InputError: the log does not match the robot.
+    """
+    return some_samples([bind_log(log, robot, contacts) for log in logs], count)
+
+
+def some_samples(logs: Sequence[Samples], count: int = COMPARED_SAMPLES) -> Samples:
+    """About `count` evenly spread samples of logs, at least one of each."""
+    most = max(1, count // max(1, len(logs)))
+    parts = [part[torch.linspace(0, len(part) - 1, min(most, len(part))).long()] for part in logs]
+    return concatenate([replace(part, unloaded=None) for part in parts])
+
+
+def equations_of(
+    pieces: Sequence[Log], model: NominalModel, count: int = COMPARED_SAMPLES, builder: RowBuilder | None = None
+) -> ForceEquations | None:
+    """Equations of filtered runs of a log, None where no force was measured; `builder` as of `ForceEquations.of`.
+
+    Raises:
+        InputError: the log does not match the robot.
+    """
+    return ForceEquations.of(bind_some_samples(pieces, model.robot, model.contacts, count), model, builder)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Unknowns estimated beside all that may differ from the URDF.
+
+    Attributes:
+        value, spread: (k,), of the whole log, and their standard deviations.
+        blocks: (TIME_BLOCKS, k), by block of time.
+        without, left: forces that the best URDF near the given one leaves unexplained without the unknowns and with
+            them, rms in `UNMODELLED_FORCE_SHARE` of the forces.
+    """
+
+    value: FloatArray
+    spread: FloatArray
+    blocks: FloatArray
+    without: float
+    left: float
+
+    @property
+    def certain(self) -> BoolArray:
+        """Unknowns (k,) that are not 0 by their standard deviations."""
+        return np.asarray(np.abs(self.value) > MIN_STANDARD_DEVIATIONS * self.spread)
+
+    @property
+    def steady(self) -> BoolArray:
+        """Unknowns (k,) that every block of time shows."""
+        return np.asarray((self.blocks * np.sign(self.value) > MIN_BLOCK_SHARE * np.abs(self.value)).all(axis=0))
+
+    def of(self, which: BoolArray) -> Estimate:
+        """The estimate of some of the unknowns (k,)."""
+        return replace(self, value=self.value[which], spread=self.spread[which], blocks=self.blocks[:, which])
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedEquations:
+    """Products of what the nominal parameters leave and of k unknowns' columns, without what may differ from the URDF.
+
+    `products`: (1 + TIME_BLOCKS, 1 + k, 1 + k), of all samples and of each block of time. `rows`: number of equations.
+    """
+
+    products: FloatArray
+    rows: int
+
+    @property
+    def left(self) -> float:
+        """What is unexplained without the unknowns."""
+        return self._rms(float(self.products[0, 0, 0]))
+
+    def _rms(self, squares: float) -> float:
+        return float(np.sqrt(max(squares, 0.0) / max(self.rows, 1)))
+
+    def fit(self, which: Sequence[int] | NDArray[np.intp], prior_std: FloatArray | float) -> Estimate:
+        """Some of the unknowns, with the standard deviations of their prior."""
+        index = np.append(0, 1 + np.asarray(which, np.intp))
+        precision = np.diag(CORRELATED_SAMPLES / np.square(np.broadcast_to(prior_std, len(which))))
+        G = self.products[:, index[:, None], index]
+        inverse = np.linalg.inv(G[:, 1:, 1:] + precision)
+        x = np.einsum("bij,bj->bi", inverse, G[:, 1:, 0])
+        squares = G[0, 0, 0] - 2.0 * G[0, 0, 1:] @ x[0] + x[0] @ G[0, 1:, 1:] @ x[0]
+        left = self._rms(float(squares))
+        spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, left**2) * np.diag(inverse[0]))
+        return Estimate(x[0], spread, x[1:], self.left, left)
+
+    def select(self, which: NDArray[np.intp]) -> ReducedEquations:
+        """Equations of some of the unknowns."""
+        index = np.append(0, 1 + which)
+        return replace(self, products=self.products[:, index[:, None], index])
+
+    def reverse_gains(self, gain: FloatArray, applied: FloatArray | float = 1.0) -> FloatArray:
+        """Gains (k,) of the columns where all that is not explained is in them, beside those of a fit (Frisch, 1934).
+
+        `applied`: gains that the readings have got.
+
+        The truth is between both: far apart where friction or armature that the URDF lacks explain the readings.
+        """
+        whole = np.eye(len(gain) + 1)
+        whole[1:, 0] = applied  # what the gains make up: unknowns are gains less 1
+        G = whole.T @ self.products[0] @ whole
+        inverse = np.linalg.inv(G + _TINY * np.trace(G) / len(G) * np.eye(len(G)))
+        with np.errstate(divide="ignore"):
+            reverse = -np.diag(inverse)[1:] / inverse[0, 1:]
+        return np.where(inverse[0, 1:] * gain < 0.0, reverse, np.copysign(np.inf, gain))
+
+
+@dataclass(frozen=True, eq=False)
+class ForceEquations:
+    """Whitened equations of some samples: what the URDF leaves of the forces, and all that may differ from it.
+
+    Attributes:
+        model, builder, samples: that they are of.
+        W: (N, n_rows, r) bases of the rows.
+        K: (N, r, P) columns of parameters, friction and armature, in standard deviations of their prior.
+        constants: (N, r, n) the same of constant torques.
+        target: (N, r) what the nominal parameters leave.
+        rows: number of equations.
+    """
+
+    model: NominalModel
+    builder: RowBuilder
+    samples: Samples
+    W: FloatArray
+    K: FloatArray
+    constants: FloatArray
+    target: FloatArray
+    rows: int
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, samples: Samples, model: NominalModel, builder: RowBuilder | None = None) -> ForceEquations | None:
+        """The equations of the forces that were measured in all samples, None without any.
+
+        `builder`: whose layouts and noise are kept where the same forces were measured.
+        """
+        sensors = _measured_sensors(samples, model)
+        if not (sensors.torque & ~model.robot.is_passive)[: model.robot.n].any() and not sensors.wrench.any():
+            return None
+        if builder is None or not _measures_alike(builder.sensors, sensors):
+            builder = RowBuilder(model.robot, model.contacts, sensors, model.declared.terms)
+        rows = np.zeros((len(samples), builder.tree.n_rows, builder.width + 1))
+        W = np.zeros((len(samples), builder.tree.n_rows, builder.tree.n_rows))
+        with one_thread():
+            for state, index in chunks_by_state(samples):
+                numbers = index if isinstance(index, slice) else index.numpy()
+                rows[numbers], W[numbers] = (x.numpy() for x in builder.rows_by_sample(samples[index], state))
+        used = np.asarray(np.abs(W).any(axis=1))
+        kept = used.any(axis=0)
+        rows = rows[:, kept]
+        W = W[:, :, kept]
+        rate = samples.joint_velocity
+        torque_rows = W[:, builder.tree.base_rows :][:, : model.robot.n]
+        terms = [
+            _joint_term(torque_rows, torch.sign(rate), JOINT_TERM_SCALE),
+            _joint_term(torque_rows, rate, JOINT_TERM_SCALE),
+            _joint_term(torque_rows, samples.joint_acceleration, ARMATURE_SCALE),
+        ]
+        K = np.concatenate([rows[..., :-1] @ _prior_columns(builder, samples, model), *terms], axis=2)
+        target = rows[..., :-1] @ builder.to_columns(model.phi)[0].numpy() - rows[..., -1]
+        constants = _joint_term(torque_rows, torch.ones_like(rate), JOINT_TERM_SCALE)
+        return cls(model, builder, samples, W, K, constants, target, int(used.sum()))
+
+    @cached_property
+    def unexplained(self) -> float:
+        """What the best URDF near the given one leaves of the forces, rms in `UNMODELLED_FORCE_SHARE` of them."""
+        A, b = self._all_that_may_differ
+        projected = A.T @ b
+        squares = b @ b - projected @ np.linalg.solve(A.T @ A + CORRELATED_SAMPLES * np.eye(A.shape[1]), projected)
+        return float(np.sqrt(max(float(squares), 0.0) / max(self.rows, 1)))
+
+    @property
+    def _all_that_may_differ(self) -> tuple[FloatArray, FloatArray]:
+        """Columns (N r, P + n) of all that may differ from the URDF, and what the nominal parameters leave, (N r,)."""
+        K = np.concatenate([self.K, self.constants], axis=2)
+        return K.reshape(-1, K.shape[2]), self.target.reshape(-1)
+
+    @property
+    def required(self) -> FloatArray:
+        """Forces (N, n_rows) that the nominal parameters need."""
+        return self.required_of(self.samples)
+
+    def required_of(self, samples: Samples) -> FloatArray:
+        """Forces (N, n_rows) that the nominal parameters need in other samples."""
+        return np.asarray(force_series(self.builder, samples, self.model.phi)[1][0])
+
+    @cached_property
+    def _inverses(self) -> dict[bool, tuple[FloatArray, list[FloatArray]]]:
+        return {}
+
+    def _differing(self, constants: bool) -> tuple[FloatArray, list[FloatArray]]:
+        """Columns of what may differ, and inverse normal matrices of all samples and of each block."""
+        if constants not in self._inverses:
+            K = np.concatenate([self.K, self.constants], axis=2) if constants else self.K
+            parts = [K[block].reshape(-1, K.shape[2]) for block in self._blocks]
+            products = [A.T @ A for A in parts]
+            regular = CORRELATED_SAMPLES * np.eye(K.shape[2])
+            self._inverses[constants] = (
+                K,
+                [np.asarray(np.linalg.inv(H + regular), np.float64) for H in (sum(products), *products)],
+            )
+        return self._inverses[constants]
+
+    @property
+    def _blocks(self) -> list[NDArray[np.intp]]:
+        return np.array_split(np.arange(len(self.target)), TIME_BLOCKS)
+
+    def reduced(self, columns: FloatArray, constants: bool = True) -> ReducedEquations:
+        """Equations of unknowns by their columns (N, n_rows, k) alone; `constants`: beside constant torques."""
+        Y = np.concatenate([self.target[..., None], np.einsum("nvr,nvk->nrk", self.W, columns)], axis=2)
+        K, inverses = self._differing(constants)
+        products = []
+        for block in self._blocks:
+            A = K[block].reshape(-1, K.shape[2])
+            B = Y[block].reshape(-1, Y.shape[2])
+            products.append((A.T @ B, B.T @ B))
+        whole = tuple(np.sum([product[i] for product in products], axis=0) for i in range(2))
+        reduced = [G - C.T @ inverse @ C for (C, G), inverse in zip((whole, *products), inverses, strict=True)]
+        return ReducedEquations(np.array(reduced), self.rows)
+
+    def _deviations(self) -> FloatArray:
+        """All that may differ from the URDF, (P + n,), in standard deviations of its prior, as it fits best."""
+        A, b = self._all_that_may_differ
+        return np.asarray(np.linalg.solve(A.T @ A + CORRELATED_SAMPLES * np.eye(A.shape[1]), A.T @ b), np.float64)
+
+    def torque_ratio(self) -> float:
+        """Size of the torques that the nominal parameters need over that of the readings, where both tell of it."""
+        n = self.model.robot.n
+        base = self.builder.tree.base_rows
+        readings = np.nan_to_num(self.builder.recorded_torque(self.samples)[:, :n].numpy())
+        read = np.einsum("njr,nj->nr", self.W[:, base : base + n], readings)
+        size = float(np.linalg.norm(read))
+        return float(np.linalg.norm(self.target + read)) / size if size > 0.0 else 1.0
+
+    def residuals(self) -> FloatArray:
+        """What the best URDF near the given one leaves of each equation, (N, r)."""
+        A, b = self._all_that_may_differ
+        return np.asarray((b - A @ self._deviations()).reshape(self.target.shape))
+
+    def declared_torque_scales(self) -> FloatArray:
+        """Factors (n,) by which torques of a bolted arm with a declared unknown scale are as large as required."""
+        n = self.model.robot.n
+        readings = np.nan_to_num(self.builder.recorded_torque(self.samples)[:, :n].numpy())
+        required = self.required
+        factor = np.ones(n)
+        for extra in self.builder.extras:
+            joints = list(extra.dofs)
+            if extra.what == "scale" and joints:
+                sizes = np.linalg.norm(required[:, joints]), np.linalg.norm(readings[:, joints])
+                factor[joints] = sizes[0] / sizes[1] if min(sizes) > 0.0 else 1.0
+        return factor
+
+
+def _joint_term(torque_rows: FloatArray, value: torch.Tensor, scale: float) -> FloatArray:
+    """Columns of joint torques in proportion to values (N, n), scaled by the prior whatever the size of the values."""
+    columns = torque_rows.transpose(0, 2, 1) * value.numpy()[:, None]
+    size = np.sqrt(np.square(columns).mean(axis=(0, 1)))
+    return np.asarray(scale * columns / np.where(size > 0.0, size, 1.0))
+
+
+def _prior_columns(builder: RowBuilder, samples: Samples, model: NominalModel) -> FloatArray:
+    """Matrix (columns, P) from unknowns in standard deviations of the prior to the builder's columns.
+
+    Friction that a URDF lacks may be as large as the torque of its joint: strain-wave gears have as much.
+    """
+    robot = model.robot
+    scale = URDF_ERROR * parameter_scale(robot.nominal)
+    scale[:, parameters.FRICTION] = 0.0
+    torque = samples.torque
+    if torque is not None:
+        rms = model.torque_ratio * np.sqrt(np.nan_to_num(np.square(torque[:, : robot.n].numpy())).mean(axis=0))
+        speed = np.sqrt(np.square(samples.joint_velocity.numpy()).mean(axis=0))
+        friction = np.stack([rms, rms / np.maximum(speed, 1e-3)], axis=1)
+        for number, body in enumerate(robot.bodies):
+            if body.joint is not None and body.joint.name in robot.joint_names:
+                scale[number, parameters.FRICTION] = friction[robot.joint_names.index(body.joint.name)]
+    scale[[body.massless for body in robot.bodies], parameters.INERTIAL] = 0.0
+    if model.unknown is not None:
+        scale[model.unknown] = np.broadcast_to(_size_of_unknown_body(robot), scale.shape)[model.unknown]
+    of_bodies = (builder.columns.parameter_map * scale.flatten())[:, scale.flatten() > 0.0]
+    out = np.zeros((builder.width, of_bodies.shape[1] + len(builder.extras)))
+    out[: len(of_bodies), : of_bodies.shape[1]] = of_bodies
+    for number, extra in enumerate(builder.extras):
+        size = model.scale_std if extra.what == "scale" else DECLARED_SIZES * extra.size
+        out[len(of_bodies) + number, of_bodies.shape[1] + number] = size
+    return out
+
+
+def _size_of_unknown_body(robot: Robot) -> FloatArray:
+    """Parameters, (12,), as large as those of a body of the usual mass that is a fifth of the robot long."""
+    masses = np.abs(robot.nominal[:, parameters.MASS])
+    mass = float(np.median(masses[masses > 0.0]))
+    length = max(0.2 * reach(robot), 0.01)
+    size = np.zeros(parameters.PER_BODY)
+    size[parameters.MASS] = mass
+    size[parameters.FIRST_MOMENT] = mass * length
+    size[parameters.INERTIA] = mass * length**2
+    return size
+
+
+def reach(robot: Robot) -> float:
+    """Length of the longest chain of joints [m]."""
+    away = np.zeros(len(robot.bodies))
+    for number, body in enumerate(robot.bodies):
+        if body.joint is not None:
+            away[number] = away[body.parent] + np.linalg.norm(body.joint.T_parent_joint[:3, 3])
+    return float(away.max())
+
+
+def _measured_sensors(samples: Samples, model: NominalModel) -> SensorSet:
+    """The sensors that were read in all samples; their noise is the unmodelled force of each kind, or more if stated.
+
+    Of a torque that is the geometric mean of the shares of its own size and of all torques' size; the latter where
+    torques have unknown scales.
+    """
+    robot = model.robot
+    contacts = model.contacts
+    torque = np.zeros(robot.n_dofs, bool)
+    of_joints = np.zeros(robot.n)
+    weight = parameters.GRAVITY * float(robot.nominal[:, parameters.MASS].sum())
+    size = 0.1 * weight
+    if samples.torque is not None:
+        values = model.torque_ratio * samples.torque.numpy()[:, : robot.n]
+        torque[: robot.n] = np.isfinite(values).all(axis=0) & (np.abs(values) > MIN_TORQUE_NM).any(axis=0)
+        rms = np.sqrt(np.square(np.nan_to_num(values)).mean(axis=0))
+        if torque.any():
+            size = float(np.sqrt(np.square(rms[torque[: robot.n]]).mean()))
+        of_joints = np.full(robot.n, size) if "joint_torque" in model.declared.terms.scales else np.sqrt(rms * size)
+    wrench = np.zeros((len(contacts), 6), bool)
+    if samples.wrench is not None:
+        for k, contact in enumerate(contacts):
+            known = samples.wrench[:, k][samples.active[:, k]].numpy()[:, list(contact.components)]
+            wrench[k, list(contact.components)] = np.isfinite(known).all()
+    stated = model.declared.noise or SensorNoise.of_known({})
+    torque_noise = np.hypot(_unmodelled(of_joints), model.torque_ratio * np.asarray(model.reading_noise))
+    noise = SensorNoise(
+        tuple(np.fmax(torque_noise, np.broadcast_to(stated.joint_torque, robot.n)).tolist()),
+        float(np.fmax(_unmodelled(0.5 * weight), stated.contact_force)),
+        float(np.fmax(_unmodelled(size), stated.contact_moment)),
+    )
+    return SensorSet(torque | robot.is_passive, wrench, noise)
+
+
+def _measures_alike(one: SensorSet, other: SensorSet) -> bool:
+    return np.array_equal(one.torque, other.torque) and np.array_equal(one.wrench, other.wrench)
+
+
+def _unmodelled(size: FloatArray | float) -> FloatArray:
+    return np.maximum(UNMODELLED_FORCE_SHARE * np.asarray(size), MIN_TORQUE_NM)
+
+
+def reading_noise(log: Log, robot: Robot) -> FloatArray:
+    """Standard deviation of each joint's torque readings from sample to sample, (n,), 0 where it is not known."""
+    noise = np.zeros(robot.n)
+    for name, column in zip(log.joint_names, np.asarray(log.joint_torque).T, strict=True):
+        known = column[np.isfinite(column)]
+        if name in robot.joint_names and len(known) > 20:
+            noise[robot.joint_names.index(name)] = rough_noise(known[:, None]).item()
+    return noise
