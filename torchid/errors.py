@@ -27,12 +27,12 @@ class InputError(TorchidError, ValueError):
     was found and what is accepted.
     """
 
-    def __init__(self, source: object, field: str, found: str, accepted: str) -> None:
+    def __init__(self, source: object, field: str, reason: str, accepted: str) -> None:
         self.source = str(source)
         self.field = field
-        self.found = found
+        self.found = reason
         self.accepted = accepted
-        super().__init__(one_line(_prefixed(source, f"{field}: {found}; accepted: {accepted}")))
+        super().__init__(one_line(_prefixed(source, f"{field}: {reason}; accepted: {accepted}")))
 
     @classmethod
     def at_field(cls: type[E], field: str, *rest: Any) -> E:
@@ -72,8 +72,8 @@ class UnknownNameError(InputError, KeyError):
         self.name = name
         self.valid = tuple(valid)
         self.what = what
-        found = f"'{name}', {what}" if what else f"unknown name '{excerpt(name)}'"
-        super().__init__(source, field, found, _nearest_names(name, self.valid))
+        reason = f"'{name}', {what}" if what else f"unknown name '{excerpt(name)}'"
+        super().__init__(source, field, reason, _nearest_names(name, self.valid))
 
     def __reduce__(self) -> tuple[object, ...]:
         return type(self), (self.source, self.field, self.name, self.valid, self.what)

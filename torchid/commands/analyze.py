@@ -204,8 +204,8 @@ def _candidates_named(names: Sequence[str], field: str, offered: Sequence[Candid
         if name not in by_name:
             raise UnknownNameError.at_field(f"analysis.{field}", name, by_name)
         if len(by_name[name]) > 1:
-            found = f"'{name}', the name of several sensors: joint, contact or fixed joint"
-            raise ConfigError.at_field(f"analysis.{field}", found, "a name that only one sensor has")
+            reason = f"'{name}', the name of several sensors: joint, contact or fixed joint"
+            raise ConfigError.at_field(f"analysis.{field}", reason, "a name that only one sensor has")
     return frozenset(by_name[name][0] for name in names)
 
 

@@ -89,8 +89,8 @@ def check_files(
             raise ConfigError("command line", given[0], "given with an experiment file", "overrides, robot.urdf=...")
         return check_experiment(path, overrides)
     if overrides:
-        found = f"{overrides[0]}, given with a log"
-        raise ConfigError("command line", "overrides", found, f"an experiment file ({', '.join(EXPERIMENTS)})")
+        reason = f"{overrides[0]}, given with a log"
+        raise ConfigError("command line", "overrides", reason, f"an experiment file ({', '.join(EXPERIMENTS)})")
     if urdf is None and (base_link or fixed_base):
         raise ConfigError("command line", given[0], "given without a robot", "--urdf too")
     return [check_log(path, urdf, base_link, fixed_base, topics, columns)]
@@ -114,11 +114,12 @@ def check_experiment(
     checked = []
     with progress_bars() as bars, files_of_recordings_kept():
         for file in bars.track(files, description="checking"):
-            settings, own = config.preprocessing, setup_of_log(setup, file)
+            settings = config.preprocessing
+            setup_of_file = setup_of_log(setup, file)
             _require_memory(file, settings)
-            log, _ = apply_contact_settings(recorded_log(file, config.logs, settings), own)
-            rest = setup.contacts, settings.filter_hz, settings.derived, setup.declared, required
-            found = check(log, own.robot, *rest)
+            log, _ = apply_contact_settings(recorded_log(file, config.logs, settings), setup_of_file)
+            settings_of_check = setup.contacts, settings.filter_hz, settings.derived, setup.declared, required
+            found = check(log, setup_of_file.robot, *settings_of_check)
             checked.append(replace(found, rolling=setup.rolling))
     return checked
 
@@ -215,7 +216,8 @@ def _contact(log: Log, index: int, shapes: CollisionShapes) -> ContactConfig:
     A point if it is a ball, if it has forces without any moment or, where neither is known, if there are more than two:
     robots with many legs seldom have soles.
     """
-    wrench, name = log.contact_wrench, log.contact_names[index]
+    wrench = log.contact_wrench
+    name = log.contact_names[index]
     force, moment = (False, False) if wrench is None else (np.nan_to_num(wrench[:, index, k]).any() for k in _WRENCH)
     many = len(log.contact_names) > 2
     is_point = shapes.about(name) is not None or (not moment and (force or many))
@@ -285,7 +287,7 @@ def convert(
     path = Path(target)
     new_log_kind(path)
     files = (file.path for file in split_range(source).files)
-    inputs = (*files, *(one for one in (topics, columns) if one is not None))
+    inputs = (*files, *(mapping for mapping in (topics, columns) if mapping is not None))
     check_free_file(path, "OUT", overwrite, inputs)
     of_topics, of_columns = _maps(topics, columns)
     with progress_bars() as bars:

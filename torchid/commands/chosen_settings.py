@@ -61,7 +61,9 @@ MARGINS = (None, 0.03, 0.06)
 MOST_TRIED = 20_000
 """Samples of a log that settings are chosen with."""
 
-_OCTAVES, _LOWEST_HZ = 8, 2.5  # of cutoffs that are tried, and the lowest: nobody moves slower to be identified
+# of cutoffs that are tried, and the lowest: nobody moves slower to be identified
+_OCTAVES = 8
+_LOWEST_HZ = 2.5
 _PERIODS = 12.0 * DROPPED_PERIODS  # of a cutoff in the shortest log, at least: of a fourth held back a third is left
 
 

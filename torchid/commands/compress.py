@@ -110,8 +110,8 @@ def _file_names(logs: Sequence[Path]) -> list[str]:
     names = [f"{split_range(log).name}{FACTORS}" for log in logs]
     again = [name for name in names if names.count(name) > 1]
     if again:
-        found = f"several logs that would become {excerpt(again[0])}"
-        raise ConfigError.at_field("logs.train", found, "logs of different names, or several calls")
+        reason = f"several logs that would become {excerpt(again[0])}"
+        raise ConfigError.at_field("logs.train", reason, "logs of different names, or several calls")
     return names
 
 

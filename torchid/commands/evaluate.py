@@ -50,7 +50,8 @@ from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
 from torchid.robot import Robot
 
-_SETTINGS, _METRICS = "config.yaml", "metrics.json"
+_SETTINGS = "config.yaml"
+_METRICS = "metrics.json"
 _NOISE: TypeAdapter[NoiseConfig] = TypeAdapter(NoiseConfig)
 FAR_OFF = 5.0
 """Times the error on the run's own logs from which on a log is not one of the same robot, moving otherwise."""

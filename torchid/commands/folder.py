@@ -194,8 +194,8 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: It
     except (OSError, ValueError) as error:
         raise ConfigError(output, "output", f"no name for a folder ({error})", "a path to a new folder") from error
     if taken:
-        found = "a link" if output.is_symlink() else "a file of this name exists"
-        raise ConfigError(output, "output", found, "a folder that does not exist yet")
+        reason = "a link" if output.is_symlink() else "a file of this name exists"
+        raise ConfigError(output, "output", reason, "a folder that does not exist yet")
     if output.name in ("", ".."):
         raise ConfigError(output, "output", "no name for a folder", "a path to a new folder")
     if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)) or len(os.fsencode(output.name)) > _LONGEST_NAME:
@@ -223,8 +223,8 @@ def check_free_file(
         ConfigError: it exists and may not be replaced, or there is no folder for it.
     """
     if os.path.lexists(path) and not (overwrite and os.path.isfile(path) and not os.path.islink(path)):
-        found = "a link" if os.path.islink(path) else "exists"
-        raise ConfigError(path, field, found, f"a new file, or {option} in place of a file")
+        reason = "a link" if os.path.islink(path) else "exists"
+        raise ConfigError(path, field, reason, f"a new file, or {option} in place of a file")
     if not os.path.isdir(path.parent):
         raise ConfigError(path, field, f"no folder {path.parent}", "a file in an existing folder")
     target = os.path.realpath(path)
@@ -250,8 +250,8 @@ def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
     for path in (current_file(), *inputs):
         target = os.path.realpath(str(path))
         if os.path.lexists(str(path)) and target.startswith(top + os.sep):
-            found = f"holds {excerpt(os.path.relpath(target, top))}, which is an input"
-            raise ConfigError(output, "output", found, "another output, or inputs that lie elsewhere")
+            reason = f"holds {excerpt(os.path.relpath(target, top))}, which is an input"
+            raise ConfigError(output, "output", reason, "another output, or inputs that lie elsewhere")
 
 
 def require_replaceable(folder: Path, kind: FolderKind, output: Path | None = None) -> FolderContents:
@@ -275,15 +275,15 @@ def require_replaceable(folder: Path, kind: FolderKind, output: Path | None = No
     if contents is None and (other := read_manifest(folder)):
         raise ConfigError(output, "output", f"holds {excerpt(other.kind)}", accepted)
     if contents is None:
-        found = f"holds {join_names(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
-        raise ConfigError(output, "output", found, accepted)
+        reason = f"holds {join_names(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
+        raise ConfigError(output, "output", reason, accepted)
     unsafe = {"which torchid did not write": contents.foreign, "changed since torchid wrote it": contents.changed}
     complaints = [f"{join_names(paths, _MOST_NAMES)}, {what}" for what, paths in unsafe.items() if paths]
     closed = [str(path) for path in contents.folders if not os.access(path, os.W_OK | os.X_OK)]
     complaints += [f"{join_names(closed)}, where nothing can be removed"] if closed and not complaints else []
     if complaints:
-        found = f"holds {' and '.join(complaints)}"
-        raise ConfigError(output, "output", found, f"{accepted}; move elsewhere what is yours")
+        reason = f"holds {' and '.join(complaints)}"
+        raise ConfigError(output, "output", reason, f"{accepted}; move elsewhere what is yours")
     return contents
 
 

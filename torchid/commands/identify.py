@@ -188,8 +188,8 @@ def _judged(fit: Fit, fitter: LogFitter, data: TrainingData, checked: TrainingLo
     warn_of_confounded([x for x in fit.extras if x.extra.what not in data.choices.adopted_terms])
     warn_of_masked(fit.parts, fitter.builder)
     if experiment.sensors.task_weights is not None and fit.jackknife is None:  # its errors alone know of weights
-        found = f"set, of logs of fewer than {LEAST_BLOCKS} blocks, whose scatter intervals come from"
-        raise ConfigError.at_field("estimator.task_weights", found, "longer logs, or no such key")
+        reason = f"set, of logs of fewer than {LEAST_BLOCKS} blocks, whose scatter intervals come from"
+        raise ConfigError.at_field("estimator.task_weights", reason, "longer logs, or no such key")
     return fit, mass
 
 

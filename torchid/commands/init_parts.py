@@ -139,8 +139,8 @@ _MOST_SENSORS = 16  # in limbs that are looked at
 
 def limb_sensors(robot: Robot) -> dict[str, str]:
     """Children of fixed joints in limbs whose names say that a force/torque sensor is there, by joint."""
-    found = fixed_joints(robot.path)
-    named = {joint: child for joint, child in found.items() if re.search(_SENSOR, f"{joint} {child}", re.IGNORECASE)}
+    fixed = fixed_joints(robot.path)
+    named = {joint: child for joint, child in fixed.items() if re.search(_SENSOR, f"{joint} {child}", re.IGNORECASE)}
     in_limbs = {joint: child for joint, child in named.items() if child in robot.links and robot.links[child][0]}
     return {joint: child for joint, child in list(in_limbs.items())[:_MOST_SENSORS] if _can_be_split(robot, joint)}
 
@@ -222,13 +222,13 @@ def log_in_folder(path: Path) -> tuple[Path, list[str]]:
     if len(files) > _FILES:
         raise LogError(path, "file", f"a folder of {len(files)} logs", f"at most {_FILES}, the files of one log")
     if (single := sorted(path.glob("*.npy"))) and not files:
-        found = f"{len(single)} arrays in files of their own, {join_names([file.name for file in single])}"
-        raise LogError(path, "file", found, f"one file of all: {_AS_ONE.format(path.name)}")
+        reason = f"{len(single)} arrays in files of their own, {join_names([file.name for file in single])}"
+        raise LogError(path, "file", reason, f"one file of all: {_AS_ONE.format(path.name)}")
     steps = {file: step for file in files if (step := _step_of(file)) is not None}
     if not steps:
         accepted = "a folder of tables or arrays that have stamps, or one recorded by ROS 2; or name the files of a log"
-        found = f"a folder, {format_count(len(files), 'log')} without stamps and fields"
-        raise LogError(path, "file", found, accepted)
+        reason = f"a folder, {format_count(len(files), 'log')} without stamps and fields"
+        raise LogError(path, "file", reason, accepted)
     used = sorted(steps, key=lambda file: steps[file])
     others = [file.name for file in files if file not in steps]
     note = f"logs: {format_count(len(used), 'file')} of the folder as one log, the fastest first"
@@ -340,7 +340,7 @@ def _gaps_in_motion(log: Log) -> tuple[float, bool, str]:
     """
     longest = 0.0
     at_end = False
-    found = ""
+    gap = ""
     for name in _MOTION:
         values = getattr(log, name)
         for missing in () if values is None else np.isnan(values).reshape(len(log), -1).T:
@@ -349,16 +349,16 @@ def _gaps_in_motion(log: Log) -> tuple[float, bool, str]:
                 continue
             at_end |= bool(missing[0] or missing[-1])
             longest = max(longest, *np.diff(log.time[known])[np.diff(known) > 1].tolist(), 0.0)
-            found = found or name
-    return longest, at_end, found
+            gap = gap or name
+    return longest, at_end, gap
 
 
 def keys_for_gaps(logs: Sequence[Log]) -> dict[str, tuple[object, str]]:
     """The keys of preprocessing that recordings with gaps in their motion need, with the reason."""
-    found = [_gaps_in_motion(log) for log in logs]
-    longest = max((x for x, *_ in found), default=0.0)
-    at_end = any(x for _, x, _ in found)
-    name = next((x for *_, x in found if x), "")
+    gaps = [_gaps_in_motion(log) for log in logs]
+    longest = max((x for x, *_ in gaps), default=0.0)
+    at_end = any(x for _, x, _ in gaps)
+    name = next((x for *_, x in gaps if x), "")
     out: dict[str, tuple[object, str]] = {}
     if 0.0 < longest <= _BRIDGED_S:
         out["bridge_gaps_s"] = (_BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")

@@ -66,7 +66,8 @@ class TrainingLogs:
 
     def __init__(self, setup: RobotSetup, bars: Progress | None = None) -> None:
         """Nothing is checked yet; `bars`: gets one for the checks, which take a while for long logs."""
-        self.setup, self._bars = setup, bars or Progress(disable=True)
+        self.setup = setup
+        self._bars = bars or Progress(disable=True)
 
     @cached_property
     def finding(self) -> tuple[str, Finding] | None:
@@ -90,9 +91,10 @@ class TrainingLogs:
         """
         if self.finding is None:
             if refused:
-                of, lower = self.setup.robot.format, lower_cutoff(self.setup)
+                form = self.setup.robot.format
+                lower = lower_cutoff(self.setup)
                 band = "" if lower is None else f"preprocessing.cutoff_hz={lower}; or "
-                accepted = f"{band}data and {of} that fit each other; usual reasons: {_USUAL.format(of=of)}"
+                accepted = f"{band}data and {form} that fit each other; usual reasons: {_USUAL.format(of=form)}"
                 raise ImplausibleFitError.at_field("logs", reason, _advice(accepted, self.setup))
             return ""
         log, finding = self.finding
@@ -122,9 +124,9 @@ def _large_findings(setup: RobotSetup, segment: LogSegment) -> list[Finding]:
     except InputError:
         return []
     checked = check(flagged, setup.robot, setup.contacts, settings.filter_hz, settings.derived, setup.declared)
-    severe = [one for one in checked.findings if one.severity in SEVERITIES[:2]]
-    reasons = [one for one in severe if one.rejects_all or one.name not in _NO_REASONS]
-    return [one for one in reasons if one.mask(len(checked.log)).mean() > _PART]
+    severe = [finding for finding in checked.findings if finding.severity in SEVERITIES[:2]]
+    reasons = [finding for finding in severe if finding.rejects_all or finding.name not in _NO_REASONS]
+    return [finding for finding in reasons if finding.mask(len(checked.log)).mean() > _PART]
 
 
 def require_plausible(
@@ -151,7 +153,8 @@ def require_plausible(
         NumericalWarning: residuals far above the stated noise.
         TorchidWarning: a bolted base that is tilted, which masses make up for in part.
     """
-    estimate, setup = fit.estimate, logs.setup
+    estimate = fit.estimate
+    setup = logs.setup
     if not estimate.rank:
         raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
     if not max(fit.assembly.problem.cost(np.zeros_like(estimate.phi)), fit.assembly.forces) > 0.0:
@@ -165,9 +168,9 @@ def require_plausible(
     mass, mass_by_data = (total_mass(fit.assembly, x, tolerance, block_error, gain_error) for x in (estimate, by_data))
     reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass_by_data, setup.robot)
     if _is_held(setup, force_gain(fit.assembly.if_known)):
-        found = "torques are those of limbs on a held base, not of feet that carry the robot"
+        refusal = "torques are those of limbs on a held base, not of feet that carry the robot"
         accepted = "robot.fixed_base: true, without contacts and preprocessing.base_motion"
-        raise ImplausibleFitError.at_field("preprocessing.base_motion", found, accepted)
+        raise ImplausibleFitError.at_field("preprocessing.base_motion", refusal, accepted)
     beyond = ""
     if not isinstance(estimate, SgdEstimate):  # a descent that is not finished leaves much that a model explains
         reason = reason or unexplained_forces(estimate, fit.assembly.problem, fit.assembly.forces, setup.noise_stated)
@@ -202,8 +205,8 @@ def _is_held(setup: RobotSetup, gain: float | None) -> bool:
 def _warn_of_tilt(samples: Sequence[Samples], setup: RobotSetup) -> None:
     """Say that a bolted base which counts as upright is tilted."""
     if samples and setup.robot.fixed_base and setup.config.robot.base_tilt is None:
-        for one in check_tilt(samples, NominalModel(setup.robot, setup.contacts, setup.declared)):
-            warn_about_file(f"robot.base_tilt: {one.found}; {one.advice}")
+        for finding in check_tilt(samples, NominalModel(setup.robot, setup.contacts, setup.declared)):
+            warn_about_file(f"robot.base_tilt: {finding.found}; {finding.advice}")
 
 
 def _require_scales(by_data: Sequence[ExtraEstimate], has_contacts: bool) -> None:
@@ -219,12 +222,12 @@ def _require_scales(by_data: Sequence[ExtraEstimate], has_contacts: bool) -> Non
     scales = {x.extra.label: 1.0 + x.value for x in by_data if x.extra.what == "scale"}
     beyond = [f"{label} {x:.2g}" for label, x in scales.items() if is_implausible_factor(x)]
     if beyond:
-        found = f"of all measured forces, which no mass determines here: {join_names(beyond)}"
+        refusal = f"of all measured forces, which no mass determines here: {join_names(beyond)}"
         accepted = "a sensor without a scale, or estimator.masses of bodies whose weight acts on it"
         if has_contacts:
             reason = "mass at a contact that always stands acts on no joint"
             accepted = f"a sensor without a scale, or logs in which each contact lifts: {reason}"
-        raise ImplausibleFitError.at_field("sensors.scales", found, accepted)
+        raise ImplausibleFitError.at_field("sensors.scales", refusal, accepted)
 
 
 def require_not_worse(worse: list[WorseThanNominal], fitted: Metrics, sensors: SensorSet, logs: TrainingLogs) -> None:
@@ -262,7 +265,8 @@ def suspected_mistake(run: Identification, logs: TrainingLogs) -> str:
         ImplausibleFitError: forces that the model does not explain, with bodies far off the robot's file, of a log that
             the checks reject.
     """
-    nominal, fitted = run.posterior.nominal_error, run.metrics["train"].identified
+    nominal = run.posterior.nominal_error
+    fitted = run.metrics["train"].identified
     is_far_off = nominal is not None and nominal.prior_is_narrow
     joints = unexplained_joints(fitted) if run.experiment.robot.fixed_base else []
     if not is_far_off and not joints:
@@ -310,7 +314,8 @@ def _beyond_bounds(phi: Array, robot: Robot) -> Iterator[str]:
     total = float(robot.nominal[:, parameters.MASS].sum())
     reach = _reach(robot)
     bound = np.empty(PER_BODY)
-    bound[parameters.MASS], bound[parameters.FIRST_MOMENT] = total, total * reach
+    bound[parameters.MASS] = total
+    bound[parameters.FIRST_MOMENT] = total * reach
     bound[parameters.INERTIA], bound[parameters.FRICTION] = total * reach**2, total * GRAVITY * max(reach, 1.0)
     beyond = ~(np.abs(phi) <= LARGEST_FACTOR * np.maximum(bound, np.abs(robot.nominal)))
     for body, parameter in np.argwhere(beyond):

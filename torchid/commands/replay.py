@@ -403,7 +403,7 @@ def _feet(contacts: Sequence[Contact], urdf: Path) -> tuple[Foot, ...]:
         try:
             feet += find_feet([FootConfig(frame=contact.frame)], urdf)
         except ConfigError as error:
-            found = f"{contact.frame}: {contact.kind}, and {urdf.name} has no collision spheres at it"
+            reason = f"{contact.frame}: {contact.kind}, and {urdf.name} has no collision spheres at it"
             accepted = f"collision spheres of the link {contact.frame}, or point contacts: a replay stands on these"
-            raise ConfigError.at_field("contacts", found, accepted) from error
+            raise ConfigError.at_field("contacts", reason, accepted) from error
     return tuple(feet)

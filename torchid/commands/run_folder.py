@@ -460,8 +460,8 @@ def _made(files: RunFiles, folder: Path) -> str:
     try:
         return page_text(files)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        found = f"not what a page needs ({excerpt(str(error))})"
-        raise InputError(folder, ", ".join(_JSON), found, _WRITTEN) from error
+        reason = f"not what a page needs ({excerpt(str(error))})"
+        raise InputError(folder, ", ".join(_JSON), reason, _WRITTEN) from error
 
 
 def _read(folder: Path) -> RunFiles:

@@ -28,8 +28,10 @@ from torchid.staging import atomic_file
 ROBOTS = ("urdf", "mjcf")
 """Formats with a file for each sample."""
 
-COUNT, COUNT_OF_ROBOTS = 10_000, 20
-MOST, MOST_ROBOTS = 200_000, 10_000
+COUNT = 10_000
+COUNT_OF_ROBOTS = 20
+MOST = 200_000
+MOST_ROBOTS = 10_000
 """Samples at most: of a humanoid, 0.6 GB; files of robots in one folder."""
 
 _WIDTHS = "a number above 0, at most 100, or auto"
@@ -124,8 +126,8 @@ def _form(form: str | None, out: Path | None) -> str:
         raise ConfigError("command line", "--format", f"'{form}'", ", ".join(SAMPLE_FORMATS))
     by_suffix = None if out is None else _BY_SUFFIX.get(out.suffix.lower())
     if out is not None and form is None and by_suffix is None:
-        found = f"'{out.name}', whose extension says no format"
-        raise ConfigError("command line", "--output", found, f"FILE.npz, FILE.json, or --format {' or '.join(ROBOTS)}")
+        reason = f"'{out.name}', whose extension says no format"
+        raise ConfigError("command line", "--output", reason, f"FILE.npz, FILE.json, or --format {' or '.join(ROBOTS)}")
     if form == "npz" and out is not None and by_suffix != "npz":
         raise ConfigError("command line", "--output", f"'{out.name}'", "FILE.npz, with --format npz")
     return form or by_suffix or "ranges"

@@ -81,9 +81,9 @@ def require_trainable(config: ExperimentConfig, resume: bool) -> None:
     if config.estimator.name != "sgd" or output is None:
         if resume:
             sgd = config.estimator.name == "sgd"
-            found = "set, without an output" if sgd else f"{config.estimator.name}, which is done in one go"
+            reason = "set, without an output" if sgd else f"{config.estimator.name}, which is done in one go"
             accepted = "an output with an unfinished run" if sgd else "estimator.name: sgd, or no --resume"
-            raise ConfigError.at_field("--resume", found, accepted)
+            raise ConfigError.at_field("--resume", reason, accepted)
         return
     folder = training_folder(output)
     refuse_link(folder)
@@ -145,7 +145,8 @@ class Training:
             KeyboardInterrupt: says how to go on.
         """
         training = self.config.estimator.training
-        builder, (size, seed, share) = fitter.builder, (training.batch_size, training.seed, self._share())
+        builder = fitter.builder
+        (size, seed, share) = (training.batch_size, training.seed, self._share())
         sampled = sampled_rows(fitter, parts)
         train = MiniBatches(logs["train"], builder, size, seed, share=share, assembly=sampled)
         held_out = None
@@ -341,8 +342,8 @@ def refusing_damage(folder: Path) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # noqa: B902 - an unpickler, torch and its optimizers raise what they like
-        found = f"not readable ({excerpt(str(error) or type(error).__name__, 200)})"
-        raise InputError(folder / CHECKPOINT, "file", found, _CHECKPOINT_ACCEPTED) from error
+        reason = f"not readable ({excerpt(str(error) or type(error).__name__, 200)})"
+        raise InputError(folder / CHECKPOINT, "file", reason, _CHECKPOINT_ACCEPTED) from error
 
 
 def sampled_rows(fitter: LogFitter, parts: Sequence[Part]) -> Assembly:

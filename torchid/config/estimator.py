@@ -213,16 +213,16 @@ def validate_keys(estimator: EstimatorConfig) -> None:
     for key, value in vars(estimator).items():
         having = _estimators_with(key)
         if estimator.name not in having and value != getattr(defaults, key):
-            found = f"set, which {estimator.name} has not"
-            raise ConfigError.at_field(f"estimator.{key}", found, f"name: {' or '.join(having)}, or no such key")
+            reason = f"set, which {estimator.name} has not"
+            raise ConfigError.at_field(f"estimator.{key}", reason, f"name: {' or '.join(having)}, or no such key")
     if estimator.name == "sgd" and estimator.consistency == "penalties":
         for key in (*_fields(_ConditionsConfig), "prior"):
             if key not in ("margin", "com_shapes") and getattr(estimator, key) != getattr(defaults, key):
-                found = "set, which consistency: penalties has not"
-                raise ConfigError.at_field(f"estimator.{key}", found, "consistency: log_cholesky, or no such key")
+                reason = "set, which consistency: penalties has not"
+                raise ConfigError.at_field(f"estimator.{key}", reason, "consistency: log_cholesky, or no such key")
     if estimator.consistency != "penalties" and estimator.penalties != defaults.penalties:
-        found = f"set, which consistency: {estimator.consistency} has not"
-        raise ConfigError.at_field("estimator.penalties", found, "consistency: penalties, or no such key")
+        reason = f"set, which consistency: {estimator.consistency} has not"
+        raise ConfigError.at_field("estimator.penalties", reason, "consistency: penalties, or no such key")
 
 
 _OF_BATCH_FITS = {"robust"}

@@ -276,8 +276,8 @@ def load_analysis(
             config.logs.require_samples(command)
             return dataclasses.replace(config, logs=_checked_logs(config, config.logs))
         if config.analysis.compare:
-            found = "set, without logs to predict accuracy from"
-            raise ConfigError.at_field("analysis.compare", found, "logs.train too")
+            reason = "set, without logs to predict accuracy from"
+            raise ConfigError.at_field("analysis.compare", reason, "logs.train too")
     return config
 
 
@@ -308,11 +308,11 @@ def _check_threshold(settings: PreprocessingConfig) -> None:
     if threshold is None:
         return
     if settings.detect_contacts is not None:
-        found = "set together with preprocessing.detect_contacts, which makes the same flags"
-        raise ConfigError.at_field(key, found, "one of the two")
+        reason = "set together with preprocessing.detect_contacts, which makes the same flags"
+        raise ConfigError.at_field(key, reason, "one of the two")
     if threshold.below is not None and threshold.below > threshold.above:
-        found = f"{threshold.below:g}, more than above ({threshold.above:g})"
-        raise ConfigError.at_field(f"{key}.below", found, "a force [N] up to that of above")
+        reason = f"{threshold.below:g}, more than above ({threshold.above:g})"
+        raise ConfigError.at_field(f"{key}.below", reason, "a force [N] up to that of above")
 
 
 def _check_extras(config: _Common) -> None:
@@ -320,18 +320,18 @@ def _check_extras(config: _Common) -> None:
     actuators = config.actuators
     sensors = config.sensors
     if actuators.torque_offset is True and "joint_torque" in sensors.offsets:
-        found = "set together with sensors.offsets.joint_torque, which is the same"
-        raise ConfigError.at_field("actuators.torque_offset", found, "one of the two")
+        reason = "set together with sensors.offsets.joint_torque, which is the same"
+        raise ConfigError.at_field("actuators.torque_offset", reason, "one of the two")
     if actuators.stribeck is not None and not config.estimator.friction:
-        found = "set, but estimator.friction: false leaves the Coulomb friction that it drops to at the URDF's"
-        raise ConfigError.at_field("actuators.stribeck", found, "estimator.friction: true, or no such key")
+        reason = "set, but estimator.friction: false leaves the Coulomb friction that it drops to at the URDF's"
+        raise ConfigError.at_field("actuators.stribeck", reason, "estimator.friction: true, or no such key")
     if config.robot.base_tilt is not None and config.preprocessing.base_motion is not None:
-        found = "set together with preprocessing.base_motion, which finds how the base itself is turned"
-        raise ConfigError.at_field("robot.base_tilt", found, "one of the two")
+        reason = "set together with preprocessing.base_motion, which finds how the base itself is turned"
+        raise ConfigError.at_field("robot.base_tilt", reason, "one of the two")
     twice = [kind for kind in ("contact_force", "contact_moment") if kind in sensors.offsets]
     if config.preprocessing.zero_in_air and twice:
-        found = "set together with preprocessing.zero_in_air, which subtracts the same"
-        raise ConfigError.at_field(f"sensors.offsets.{twice[0]}", found, "one of the two")
+        reason = "set together with preprocessing.zero_in_air, which subtracts the same"
+        raise ConfigError.at_field(f"sensors.offsets.{twice[0]}", reason, "one of the two")
 
 
 def _checked_logs(config: _Common, logs: LogsConfig) -> LogsConfig:

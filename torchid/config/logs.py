@@ -82,8 +82,8 @@ class LogsConfig:
     def require_samples(self, command: str) -> None:
         """Refuse factors where samples are needed. Raises ConfigError: names the file."""
         if self.compressed:
-            found = f"{self.train[0]}, factors of a log, where torchid {command} needs its samples"
-            raise ConfigError.at_field("logs.train", found, f"logs ({', '.join(READABLE)})")
+            reason = f"{self.train[0]}, factors of a log, where torchid {command} needs its samples"
+            raise ConfigError.at_field("logs.train", reason, f"logs ({', '.join(READABLE)})")
 
 
 # ------------------------------------------------------------------------------------------------ entries in words
@@ -120,7 +120,7 @@ def _add_payloads(payloads: dict[str, Any], field: str, entry: object) -> None:
     field = f"{field}.payload"
     given = entry["payload"]
     several = given if isinstance(given, list) else [given]
-    new = [_payload(field if given is not several else f"{field}.{k}", one) for k, one in enumerate(several)]
+    new = [_payload(field if given is not several else f"{field}.{k}", payload) for k, payload in enumerate(several)]
     file = _file(field, entry)
     if not new:
         raise ConfigError.at_field(field, "an empty list", PAYLOAD_ACCEPTED)
@@ -141,8 +141,8 @@ def _payload(field: str, given: object) -> dict[str, Any]:
     except ValidationError as error:
         first = error.errors()[0]
         key = str(first["loc"][0])
-        found = "missing" if first["type"] == "missing" else f"found {excerpt(repr(given[key]))}"
-        raise ConfigError.at_field(f"{field}.{key}", found, _PAYLOAD_ACCEPTED[key]) from error
+        reason = "missing" if first["type"] == "missing" else f"found {excerpt(repr(given[key]))}"
+        raise ConfigError.at_field(f"{field}.{key}", reason, _PAYLOAD_ACCEPTED[key]) from error
     return dict(given)
 
 
@@ -158,9 +158,9 @@ def _names(field: str, entry: object) -> Iterator[object]:
     folds = [key for key in ("fold", "without_fold") if key in entry]
     bounds = [key for key in ("from", "to") if key in entry]
     if len(folds) + bool(bounds) > 1 or ("of" in entry and not folds):
-        found = f"{' and '.join([*folds, *bounds, *(['of'] if not folds else [])])} together"
+        reason = f"{' and '.join([*folds, *bounds, *(['of'] if not folds else [])])} together"
         accepted = "from and to, or fold, or without_fold; of (the number of folds) with one of the last two"
-        raise ConfigError.at_field(field, found, accepted)
+        raise ConfigError.at_field(field, reason, accepted)
     if not folds:
         start, stop = (_bound(f"{field}.{key}", entry.get(key)) for key in ("from", "to"))
         yield f"{file}[{start}:{stop}]" if bounds else file
@@ -177,13 +177,13 @@ def _file(field: str, entry: Mapping[str, object]) -> str:
             raise ConfigError.at_field(field, "file and files together", "one of the two")
         files = entry["files"]
         if not isinstance(files, list) or len(files) < 2:
-            found = "one file" if isinstance(files, list) and files else f"found {excerpt(repr(files))}"
-            raise ConfigError.at_field(f"{field}.files", found, f"{_FILES}; file for a single one")
+            reason = "one file" if isinstance(files, list) and files else f"found {excerpt(repr(files))}"
+            raise ConfigError.at_field(f"{field}.files", reason, f"{_FILES}; file for a single one")
         return join_files([_joined(f"{field}.files.{number}", joined) for number, joined in enumerate(files)])
     file = entry.get("file")
     if not isinstance(file, str) or not file:
-        found = "missing" if "file" not in entry else f"found {excerpt(repr(file))}"
-        raise ConfigError.at_field(f"{field}.file", found, _ENTRY)
+        reason = "missing" if "file" not in entry else f"found {excerpt(repr(file))}"
+        raise ConfigError.at_field(f"{field}.file", reason, _ENTRY)
     return file
 
 
@@ -264,13 +264,13 @@ def _resolved_payloads(logs: LogsConfig) -> dict[str, list[Payload]]:
     for name, payloads in logs.payloads.items():
         field = "logs.payloads"
         if not Path(name).is_absolute():
-            found = f"{name}, a relative path"
+            reason = f"{name}, a relative path"
             accepted = "payload: {...} in an entry of logs.train or logs.test"
-            raise ConfigError.at_field(field, found, accepted)
+            raise ConfigError.at_field(field, reason, accepted)
         for path in _matching(field, [Path(name)]):
             if path.suffix == FACTORS:
-                found = f"{path}, factors, which torchid compress has freed of a payload already"
-                raise ConfigError.at_field(field, found, "payloads of logs")
+                reason = f"{path}, factors, which torchid compress has freed of a payload already"
+                raise ConfigError.at_field(field, reason, "payloads of logs")
             recording = _recording(_part(field, path))
             if out.get(recording, payloads) != payloads:
                 raise ConfigError.at_field(field, f"two for {recording}", "one payload in all of a recording")
@@ -337,8 +337,8 @@ def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         part = _part(field, path)
         if part.range is not None and part.file.suffix == FACTORS:
-            found = f"{path}, a part of factors, which have no samples"
-            raise ConfigError.at_field(field, found, f"{FACTORS} files as they are, or parts of logs")
+            reason = f"{path}, a part of factors, which have no samples"
+            raise ConfigError.at_field(field, reason, f"{FACTORS} files as they are, or parts of logs")
         if part.joins and {"*", "?"} & set("".join(file.path.name for file in part.files)):
             raise ConfigError.at_field(
                 field, f"{path}, a pattern among several files", f"every file, {JOINED_ACCEPTED}"
@@ -349,8 +349,8 @@ def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
         files = _listed(part.file)
         if part.range is not None:
             if named := _listed(path):
-                found = f"{path}, a pattern with a range, but {named[0].name} is a file that it matches without one"
-                raise ConfigError.at_field(field, found, "names without brackets, or each log by its name")
+                reason = f"{path}, a pattern with a range, but {named[0].name} is a file that it matches without one"
+                raise ConfigError.at_field(field, reason, "names without brackets, or each log by its name")
             files = [file.with_name(file.name + part.range.text) for file in files]
         if not files:
             raise ConfigError.at_field(field, f"no file matches {part.file}", "a log, or a pattern of several")

@@ -80,8 +80,8 @@ class RobotFile:
 def require_one_file(robot: RobotFile) -> None:
     """Refuse a robot of no file or of two. Raises ConfigError: names both keys."""
     if (robot.urdf is None) == (robot.mjcf is None):
-        found = "missing" if robot.urdf is None else "set together with robot.mjcf"
-        raise ConfigError.at_field("robot.urdf", found, "a path to a URDF, or robot.mjcf: a path to a MuJoCo model")
+        reason = "missing" if robot.urdf is None else "set together with robot.mjcf"
+        raise ConfigError.at_field("robot.urdf", reason, "a path to a URDF, or robot.mjcf: a path to a MuJoCo model")
 
 
 def require_kind(robot: RobotFile) -> None:

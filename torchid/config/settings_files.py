@@ -130,8 +130,8 @@ def explain_syntax(error: yaml.MarkedYAMLError, text: str, wanted: str) -> tuple
     why = f"{error.problem} {error.context}" if error.context else str(error.problem)
     if error.context_mark is not None and error.context_mark.line != mark.line:
         why += f" from line {error.context_mark.line + 1} on"
-    found = f"{where}, column {mark.column + 1}: {why}" + f", in '{shown}'" * bool(shown)
-    return found, wanted + _BRACKETS * ("flow sequence" in why)
+    reason = f"{where}, column {mark.column + 1}: {why}" + f", in '{shown}'" * bool(shown)
+    return reason, wanted + _BRACKETS * ("flow sequence" in why)
 
 
 def inline_yaml(value: object) -> str:
@@ -283,15 +283,15 @@ def _read(kind: FileKind[T], path: Path) -> Settings:
     except _NO_YAML as error:
         raise _no_settings(kind, path, f"not readable: {_why(error)}", "a YAML mapping") from error
     if not isinstance(loaded, dict):
-        found = "a list" if isinstance(loaded, list) else f"text, {excerpt(text.strip(), 40)}"
-        raise _no_settings(kind, path, found, f"a mapping with {kind.keys}")
+        reason = "a list" if isinstance(loaded, list) else f"text, {excerpt(text.strip(), 40)}"
+        raise _no_settings(kind, path, reason, f"a mapping with {kind.keys}")
     return loaded
 
 
-def _no_settings(kind: FileKind[T], path: Path, found: str, accepted: str) -> ConfigError:
+def _no_settings(kind: FileKind[T], path: Path, reason: str, accepted: str) -> ConfigError:
     if path.suffix.lower() in READABLE:
         return ConfigError(path, "file", f"a log, not a file of settings ({kind.keys})", f"a YAML {kind.name} file")
-    return ConfigError(path, "YAML", found, accepted)
+    return ConfigError(path, "YAML", reason, accepted)
 
 
 def _why(error: Exception) -> str:

@@ -210,8 +210,8 @@ def _reduced(rows: list[LinearCondition], count: int) -> tuple[Array, Array]:
     off = np.abs(e - U[:, kept] @ (U[:, kept].T @ e)) > EQUAL_WITHIN * (1.0 + np.abs(e).max(initial=0.0))
     if off.any():
         names = ", ".join(dict.fromkeys(row.name for row, wrong in zip(rows, off, strict=True) if wrong))
-        found = "contradicts what is held fixed or the other equalities"
-        raise InputError("estimator", names, found, "equalities that some parameters meet")
+        reason = "contradicts what is held fixed or the other equalities"
+        raise InputError("estimator", names, reason, "equalities that some parameters meet")
     return right[kept], (U[:, kept].T @ e) / values[kept]
 
 
@@ -233,7 +233,9 @@ def _without_implied(rows: list[LinearCondition], E: Array, e: Array) -> list[Li
 
 Prior = Literal["euclidean", "pullback", "entropic"]
 
-_FLOOR_OF_DATA, _FLOOR_OF_RIDGE = 1e-8, 1e-3  # shares of the mean square of the data, of the ridge
+# shares of the mean square of the data, of the ridge
+_FLOOR_OF_DATA = 1e-8
+_FLOOR_OF_RIDGE = 1e-3
 
 
 class _Scaled:
@@ -251,7 +253,8 @@ class _Scaled:
         Of all but the Euclidean one the entries of U, with J = J_0 + L U L^T, are variables: so the prior is equally
         stiff in all directions. In units of the scale it would be 1e20 times stiffer across a flat body than along it.
         """
-        self.name, terms = conditions.body_name, 0 if problem.terms is None else len(problem.terms.size)
+        self.name = conditions.body_name
+        terms = 0 if problem.terms is None else len(problem.terms.size)
         self.free = problem.free.reshape(-1, PER_BODY)
         self.scale = problem.scale.reshape(-1, PER_BODY)
         self.start = np.concatenate([problem.nominal / problem.scale, np.zeros(terms)])
@@ -315,7 +318,7 @@ def build_conic_problem(
     margin = -conditions.margin * np.eye(4)  # Wensing, Kim, Slotine 2018
     blocks = [x.block(f"pseudo-inertia of {x.name(k)}", k, margin, parameters.PSEUDO_BASIS) for k in x.bodies]
     rows = _inequalities(x, problem, conditions)
-    for enclosure in (one for one in conditions.enclosures if one.body in x.bodies):
+    for enclosure in (candidate for candidate in conditions.enclosures if candidate.body in x.bodies):
         if enclosure.kind == "ellipsoid":
             blocks.append(_ellipsoid_block(x, enclosure))
         else:
@@ -413,7 +416,9 @@ def _box_conditions(x: _Scaled, enclosure: Enclosure) -> list[LinearCondition]:
 
 def _inequalities(x: _Scaled, problem: LinearProblem, conditions: Conditions) -> list[LinearCondition]:
     """Bounds of the free parameters, except coinciding ones, which are equalities, and conditions on terms."""
-    out, terms, (lower, upper) = list[LinearCondition](), problem.terms, conditions.bounds(len(x.free))
+    out = list[LinearCondition]()
+    terms = problem.terms
+    (lower, upper) = conditions.bounds(len(x.free))
     differ = upper - lower > EQUAL_WITHIN * x.scale
     for bound, sign, word in ((lower, 1.0, "lower"), (upper, -1.0, "upper")):
         for body, number in zip(*np.nonzero(np.isfinite(bound) & x.free & differ), strict=True):
@@ -429,7 +434,9 @@ def _inequalities(x: _Scaled, problem: LinearProblem, conditions: Conditions) ->
 
 def _equalities(x: _Scaled, conditions: Conditions) -> list[LinearCondition]:
     """Total mass, mirror images and bounds that coincide."""
-    out, scale, (lower, upper) = list[LinearCondition](), x.scale, conditions.bounds(len(x.free))
+    out = list[LinearCondition]()
+    scale = x.scale
+    (lower, upper) = conditions.bounds(len(x.free))
     if conditions.total_mass is not None:
         masses = scale[:, parameters.MASS] / conditions.total_mass
         weights = {(body, parameters.MASS): float(mass) for body, mass in enumerate(masses)}
@@ -456,8 +463,8 @@ def _pseudo_inertia_root(scaled: Array, called: str, prior: Prior) -> Array:
     """L, (4, 4), of the pseudo-inertia J = L L^T of scaled parameters (12,)."""
     J = parameters.pseudo_inertia(scaled)
     if np.linalg.eigvalsh(J)[0] <= np.finfo(float).eps * np.trace(J):
-        found = f"{prior}, but the pseudo-inertia of {called} that it is relative to is not positive definite"
-        raise InputError("estimator", "prior", found, "euclidean, or physically consistent bodies")
+        reason = f"{prior}, but the pseudo-inertia of {called} that it is relative to is not positive definite"
+        raise InputError("estimator", "prior", reason, "euclidean, or physically consistent bodies")
     return np.asarray(np.linalg.cholesky(J))
 
 
@@ -468,7 +475,9 @@ _PHASE_ONE_ROOT = 1e-6  # of the deviations, by the slack, in the objective of p
 _GOOD_SLACK = 1e-6  # of a starting point, at which phase I stops
 _LEAST_SLACK = 1e-9  # of a starting point that is accepted if phase I finds no better one
 _MOST_SLACK = 0.01  # bound of the slack in phase I
-_ROOM, _MOVES = 0.1, 3  # at rows of a starting point, and moves to get there
+# at rows of a starting point, and moves to get there
+_ROOM = 0.1
+_MOVES = 3
 _SHORTEST = 1e-6  # least share of a step: below, rounding decides about feasibility
 
 
@@ -569,7 +578,9 @@ _SHARE = 0.98  # of the longest step that stays inside
 _CENTRE_SHRINK = 0.1  # of the barrier's weight from step to step towards a point of the central path
 _CENTRED_CHANGE = 1e-9  # relative, of blocks and slacks, in the last of these steps
 _SHORT = 0.2  # length of a corrected step below which a plain one is taken
-_ACCURATE, _CENTRED = 1e-9, 0.5  # complementarity, relative to the objective, from which on the gap itself is computed
+# complementarity, relative to the objective, from which on the gap itself is computed
+_ACCURATE = 1e-9
+_CENTRED = 0.5
 
 
 @one_thread()

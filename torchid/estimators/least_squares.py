@@ -20,8 +20,11 @@ from torchid.reprs import short_repr
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolerance
 from torchid.settings import NotNegative, Tolerance, validate_settings
 
-IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
-UNOBSERVABLE, FIXED = "unobservable", "fixed"
+IDENTIFIED = "identified"
+PRIOR = "dominated by the prior"
+COMBINED = "only in combination"
+UNOBSERVABLE = "unobservable"
+FIXED = "fixed"
 VERDICTS = (IDENTIFIED, PRIOR, COMBINED, UNOBSERVABLE, FIXED)
 
 _OBSERVABLE = 1e-12  # squared share in the row space: that of a finger in a sum with the trunk's mass is 1e-7
@@ -176,9 +179,9 @@ def report_rounding(estimator: str) -> Iterator[None]:
     try:
         yield
     except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-        found = f"{estimator} failed numerically ({error})"
+        reason = f"{estimator} failed numerically ({error})"
         accepted = "a larger ridge, fewer free parameters, or nominal bodies of plausible masses and sizes"
-        raise InputError("estimator", "name", found, accepted) from error
+        raise InputError("estimator", "name", reason, accepted) from error
 
 
 @dataclass(frozen=True)
@@ -267,10 +270,12 @@ class LeastSquares(Regularized):
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
         observable = np.zeros(len(phi), dtype=bool)
         identifiable = np.zeros(len(phi), dtype=bool)
-        observable[free], identifiable[free] = null_share**2 < 1.0 - _OBSERVABLE, null_share < UNOBSERVABLE_SHARE
+        observable[free] = null_share**2 < 1.0 - _OBSERVABLE
+        identifiable[free] = null_share < UNOBSERVABLE_SHARE
         noise_error = np.full(len(phi), np.nan)
         data_share = np.full(len(phi), np.nan)
-        noise_error[free], by_data = noise * scale * np.linalg.norm(gain, axis=1), A
+        noise_error[free] = noise * scale * np.linalg.norm(gain, axis=1)
+        by_data = A
         if problem.shrinkage is not None and problem.parameter_shrinkage is not None:
             noise_error[free] = np.hypot(noise_error[free], scale * np.linalg.norm(gain @ problem.shrinkage, axis=1))
             by_data = A - problem.parameter_shrinkage

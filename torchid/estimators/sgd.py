@@ -579,32 +579,32 @@ def least_penalized(settings: Sgd, problem: LinearProblem, start: Minimizer) -> 
 _MET = 1e-9  # violation of a condition, in units of the scale, that is rounding
 
 
-def nearest_allowed(settings: Sgd, problem: LinearProblem, found: Minimizer) -> Minimizer:
+def nearest_allowed(settings: Sgd, problem: LinearProblem, minimizer: Minimizer) -> Minimizer:
     """The parameters that meet all conditions of a descent and are nearest to what it has found.
 
     Near by what the mean squared whitened residual and the ridge make of the difference.
     """
     conic = settings.conic_problem(problem)
-    x = np.asarray(np.linalg.solve(conic.deviations, deviations(problem, found)), dtype=np.float64)
+    x = np.asarray(np.linalg.solve(conic.deviations, deviations(problem, minimizer)), dtype=np.float64)
     if conic.slack(x).min(initial=0.0) >= -_MET and np.abs(conic.E @ x - conic.e).max(initial=0.0) <= _MET:
-        return found
+        return minimizer
     terms = problem.terms
-    moved = replace(problem, nominal=found.phi, b=problem.A @ found.phi, residual=0.0)
-    if terms is not None and found.psi is not None:
-        moved = replace(moved, terms=replace(terms, z=terms.C @ found.phi + terms.D @ found.psi))
+    moved = replace(problem, nominal=minimizer.phi, b=problem.A @ minimizer.phi, residual=0.0)
+    if terms is not None and minimizer.psi is not None:
+        moved = replace(moved, terms=replace(terms, z=terms.C @ minimizer.phi + terms.D @ minimizer.psi))
     return replace(settings.consistent, prior="euclidean").minimize(moved)
 
 
-def deviations(problem: LinearProblem, found: Minimizer) -> Array:
+def deviations(problem: LinearProblem, minimizer: Minimizer) -> Array:
     """Deviations of the free parameters and terms in units of their scale, (n,)."""
-    y = ((found.phi - problem.nominal) / problem.scale)[problem.free]
-    if problem.terms is None or found.psi is None:
+    y = ((minimizer.phi - problem.nominal) / problem.scale)[problem.free]
+    if problem.terms is None or minimizer.psi is None:
         return np.asarray(y)
-    return np.append(y, found.psi / problem.terms.size)
+    return np.append(y, minimizer.psi / problem.terms.size)
 
 
 @one_thread()
-def excess(settings: Sgd, problem: LinearProblem, found: Minimizer) -> float:
+def excess(settings: Sgd, problem: LinearProblem, minimizer: Minimizer) -> float:
     """How far the objective of a minimizer is above the least one at most, as a share of that or of what counts as 0.
 
     The least one is that of the interior-point method; with penalties, which only add to the quadratic, it is at least
@@ -612,14 +612,14 @@ def excess(settings: Sgd, problem: LinearProblem, found: Minimizer) -> float:
     """
     if settings.consistency == "penalties":
         penalized = Objective(settings, problem)
-        value, slope = penalized.slope(deviations(problem, found))
+        value, slope = penalized.slope(deviations(problem, minimizer))
         least = value - 0.5 * float(slope @ np.linalg.pinv(penalized.hessian.numpy(), hermitian=True) @ slope)
         return (value - least) / max(least, penalized.floor)
     conic = settings.conic_problem(problem)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)  # of its gap, which counts below
         best = solve_barrier(conic)
-    x = np.asarray(np.linalg.solve(conic.deviations, deviations(problem, found)), dtype=np.float64)
+    x = np.asarray(np.linalg.solve(conic.deviations, deviations(problem, minimizer)), dtype=np.float64)
     value = conic.objective(x)
     least = best.objective - (best.gap if np.isfinite(best.gap) else 0.0)
     return (value - least) / max(least, conic.floor)

@@ -173,10 +173,10 @@ class Loss(nn.Module):
 def _difference(problem: LinearProblem, data: LinearProblem, device: torch.device) -> Callable[[Tensor], Tensor]:
     """Mean square that a problem has beside that of the samples alone, as of known masses, at parameters and terms."""
 
-    def quadratic(one: LinearProblem) -> tuple[Tensor, Tensor]:
-        A = one.A
-        b = one.b
-        terms = one.terms
+    def quadratic(problem: LinearProblem) -> tuple[Tensor, Tensor]:
+        A = problem.A
+        b = problem.b
+        terms = problem.terms
         if terms is not None:
             A = np.block([[A, np.zeros((len(A), len(terms.size)))], [terms.C, terms.D]])
             b = np.append(b, terms.z)
@@ -322,8 +322,8 @@ class Trainer:
                 other.
         """
         if batches.share[1] > 1 and (residual is not None or settings.optimizer["name"] in FULL_BATCH):
-            found = f"a share of {batches.share[1]}, with a residual module or {settings.optimizer['name']}"
-            raise ValueError(f"batches: {found}; accepted: whole batches")
+            reason = f"a share of {batches.share[1]}, with a residual module or {settings.optimizer['name']}"
+            raise ValueError(f"batches: {reason}; accepted: whole batches")
         settings.try_out()
         self.settings = settings
         self.problem = problem
@@ -506,17 +506,17 @@ class Trainer:
     def _snapshot(self) -> dict[str, Tensor]:
         return {name: x.detach().clone() for name, x in self.loss.state_dict().items()}
 
-    def _objective(self, found: Minimizer) -> float:
+    def _objective(self, minimizer: Minimizer) -> float:
         """Mean squared whitened residual plus prior."""
-        y = deviations(self.problem, found)
+        y = deviations(self.problem, minimizer)
         return self._conic.objective(np.asarray(np.linalg.solve(self._conic.deviations, y), dtype=np.float64))
 
     def _require_converging(self, loss: float) -> None:
         if not loss <= _DIVERGED * max(1.0, self.problem.cost(self.problem.nominal) / max(self.problem.rows, 1)):
             name = self.settings.optimizer["name"]
             rate = float(self.optimizer.param_groups[0]["lr"])
-            found = f"a loss of {loss:.3g} in epoch {self.epoch}, with {name} at lr {rate:.3g}"
-            raise InputError("estimator", "training", found, "a smaller lr")
+            reason = f"a loss of {loss:.3g} in epoch {self.epoch}, with {name} at lr {rate:.3g}"
+            raise InputError("estimator", "training", reason, "a smaller lr")
 
     def _steps(self) -> Iterator[tuple[Callable[[], Iterable[tuple[Batch, int]]], int]]:
         """Batches of each step of an epoch with the number of samples of each, and of all of them."""

@@ -31,7 +31,8 @@ small. With a quarter it is within 1 %, for as many passes.
 """
 
 _RARE = 0.01  # share of draws that a condition excludes, above which it counts as near
-_DRAWS, _PASSES = 400, 6
+_DRAWS = 400
+_PASSES = 6
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,9 @@ _INSIDE = 1e-12  # least pivot of a block and slack of a row, relative to the me
 _ALIKE = 0.25  # correlation of a coordinate with what it was, in all chains, below which states count as new
 _MOST = 200  # passes after which moves of pairs count as too slow
 _BURN_IN = 4  # times as many passes as make states new, before the first is used
-_SHRINK, _SHRINKS = 0.8, 200  # of draws from the Gaussian that are outside, towards its mean
+# of draws from the Gaussian that are outside, towards its mean
+_SHRINK = 0.8
+_SHRINKS = 200
 _DIAGONAL = tuple(np.flatnonzero(UPPER[0] == UPPER[1]).tolist())
 
 
@@ -430,7 +433,9 @@ def _pairs(gaussian: BarrierGaussian, owners: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(np.isin(owners, bodies[list(pair)])) for pair in pairs]
 
 
-_BATCH_CHAINS, _BATCHES = 512, 2  # chains of a batch, which one thread works on, and batches at most
+# chains of a batch, which one thread works on, and batches at most
+_BATCH_CHAINS = 512
+_BATCHES = 2
 
 
 class TruncatedGaussian(torch.nn.Module):

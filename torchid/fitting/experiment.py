@@ -100,9 +100,9 @@ def require_comparable(noise: Sequence[float]) -> None:
     low = min(noise, default=1.0)
     high = max(noise, default=1.0)
     if low < 1e-9 or high > min(1e6, 1e7 * low):
-        found = f"from {low:g} to {high:g}"
+        reason = f"from {low:g} to {high:g}"
         accepted = "from 1e-9 to 1e6, the largest at most 1e7 times the smallest"
-        raise InputError.at_field("sensors.noise", f"standard deviations {found}", accepted)
+        raise InputError.at_field("sensors.noise", f"standard deviations {reason}", accepted)
 
 
 def task_weights(config: TaskWeightsConfig, robot: Robot) -> Array | None:
@@ -192,9 +192,9 @@ def _require_base_axes(robot: Robot, topics: Topics | None) -> None:
             raise ConfigError.at_field("logs.topics.imu.frame", "missing, with orientation: true", "a link of the base")
         if topic.frame in robot.links and robot.links[topic.frame][0] == 0 and not is_along_base(robot, topic.frame):
             angle = np.degrees(_angle_to_base(robot, topic.frame))
-            found = f"'{topic.frame}', which is turned by {angle:.0f} deg against {robot.base_link}"
+            reason = f"'{topic.frame}', which is turned by {angle:.0f} deg against {robot.base_link}"
             accepted = "a frame along the base's axes, or orientation: false, which leaves the IMU's quaternion out"
-            raise ConfigError.at_field(f"logs.topics.{key}.frame", found, accepted)
+            raise ConfigError.at_field(f"logs.topics.{key}.frame", reason, accepted)
 
 
 def is_along_base(robot: Robot, link: str) -> bool:
@@ -280,14 +280,14 @@ def suited_to_preprocessing(
         raise ConfigError.at_field("preprocessing.zero_in_air", "true, without contacts", "false, or contacts")
     if settings.detect_contacts is not None:
         if robot.loops:
-            found = f"set, for a robot with {format_count(len(robot.loops), 'closed loop')}"
-            raise ConfigError.at_field("preprocessing.detect_contacts", found, "contact_threshold, or recorded flags")
+            reason = f"set, for a robot with {format_count(len(robot.loops), 'closed loop')}"
+            raise ConfigError.at_field("preprocessing.detect_contacts", reason, "contact_threshold, or recorded flags")
         touch = settings.detect_contacts.touch
         lift = settings.detect_contacts.lift
         if lift > touch:
-            found = f"{lift:g}, above touch ({touch:g})"
+            reason = f"{lift:g}, above touch ({touch:g})"
             accepted = "a share of the weight up to that of touch"
-            raise ConfigError.at_field("preprocessing.detect_contacts.lift", found, accepted)
+            raise ConfigError.at_field("preprocessing.detect_contacts.lift", reason, accepted)
     if settings.base_motion is not None:
         _require_floor(contacts)
     return contacts
@@ -296,13 +296,13 @@ def suited_to_preprocessing(
 def _require_floor(contacts: tuple[Contact, ...]) -> None:
     """Refuse contacts that do not say how a base stands above one floor, even if all stand."""
     if sum(map(points_of, contacts)) < FEWEST_POINTS:
-        found = f"contacts, but the experiment has {', '.join(f'{c.kind} {c.frame}' for c in contacts) or 'none'}"
-        raise ConfigError.at_field("preprocessing.base_motion", found, f"{FEET} among the contacts")
+        reason = f"contacts, but the experiment has {', '.join(f'{c.kind} {c.frame}' for c in contacts) or 'none'}"
+        raise ConfigError.at_field("preprocessing.base_motion", reason, f"{FEET} among the contacts")
     for index, contact in enumerate(contacts):
         if not np.allclose(contact.normal, contacts[0].normal, rtol=0.0, atol=1e-9):
-            found = f"{join_numbers(contact.normal)}, but contacts[0] has {join_numbers(contacts[0].normal)}"
+            reason = f"{join_numbers(contact.normal)}, but contacts[0] has {join_numbers(contacts[0].normal)}"
             accepted = "one floor for all contacts, or preprocessing.base_motion: null"
-            raise ConfigError.at_field(f"contacts[{index}].normal", found, accepted)
+            raise ConfigError.at_field(f"contacts[{index}].normal", reason, accepted)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -554,12 +554,22 @@ def set_up_robot(config: ExperimentConfig | AnalyzeConfig) -> RobotSetup:
     """
     require_device(config.device)
     try:
-        of = config.robot
-        require_kind(of)
-        loops = [loop.loop for loop in of.loops]
+        settings = config.robot
+        require_kind(settings)
+        loops = [loop.loop for loop in settings.loops]
         joints = _ft_joints(config)
         total = None if (mass := config.estimator.total_mass) is None else mass.value
-        robot = load_robot(of.path, of.base_link, of.fixed_base, joints, of.weld, of.tilt, loops, of.passive, total)
+        robot = load_robot(
+            settings.path,
+            settings.base_link,
+            settings.fixed_base,
+            joints,
+            settings.weld,
+            settings.tilt,
+            loops,
+            settings.passive,
+            total,
+        )
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise

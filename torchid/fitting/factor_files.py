@@ -120,43 +120,43 @@ class RowModel:
         return cls(settings, noise_of_sensors(builder), geometry)
 
 
-def require_same_rows(path: object, found: RowModel, expected: RowModel, reference: str) -> None:
+def require_same_rows(path: object, actual: RowModel, expected: RowModel, reference: str) -> None:
     """Refuse factors of rows that were formed with something else than others; noise is another matter.
 
     Args:
         path: of the factors, for the message.
-        found: what they were formed with.
+        actual: what they were formed with.
         expected: what they should have been formed with.
         reference: where that is stated.
 
     Raises:
         LogError: names the setting, its value and the accepted one.
     """
-    for key in (*expected.settings, *(key for key in found.settings if key not in expected.settings)):
-        value = found.settings.get(key)
+    for key in (*expected.settings, *(key for key in actual.settings if key not in expected.settings)):
+        value = actual.settings.get(key)
         other = expected.settings.get(key)
         if value != other:
             raise LogError(path, key, *_texts(value, other, reference))
-    if found.noise.keys() != expected.noise.keys():
-        raise LogError(path, NOISE, join_names(list(found.noise)) or "none", join_names(list(expected.noise)))
+    if actual.noise.keys() != expected.noise.keys():
+        raise LogError(path, NOISE, join_names(list(actual.noise)) or "none", join_names(list(expected.noise)))
     for name, array in expected.geometry.items():
-        array_found = found.geometry[name]
+        array_found = actual.geometry[name]
         if array_found.shape != array.shape or not np.allclose(array_found, array, rtol=0.0, atol=KINEMATIC_TOLERANCE):
             raise LogError(
                 path, "robot.urdf", _where(name, array_found, array, expected), f"the kinematics of {reference}"
             )
 
 
-def require_same_noise(path: object, found: RowModel, expected: RowModel, reference: object) -> None:
+def require_same_noise(path: object, actual: RowModel, expected: RowModel, reference: object) -> None:
     """Refuse factors that were weighted with other noise than others, of rows that are alike otherwise.
 
     Raises:
         LogError: names the noise, its value and the accepted one.
     """
     for group, value in expected.noise.items():
-        if not np.isclose(found.noise[group], value, rtol=KINEMATIC_TOLERANCE, atol=0.0):
+        if not np.isclose(actual.noise[group], value, rtol=KINEMATIC_TOLERANCE, atol=0.0):
             accepted = f"{value:g}, as in {reference}: compress with all of sensors.noise stated"
-            raise LogError(path, f"{NOISE}.{group}", f"{found.noise[group]:g}", accepted)
+            raise LogError(path, f"{NOISE}.{group}", f"{actual.noise[group]:g}", accepted)
 
 
 def _contact_text(contact: Contact) -> str:
@@ -183,11 +183,11 @@ def _channels(robot: Robot, builder: RowBuilder) -> list[str]:
     ]
 
 
-def _texts(found: Value, expected: Value, reference: str) -> tuple[str, str]:
+def _texts(actual: Value, expected: Value, reference: str) -> tuple[str, str]:
     """What was found and what is accepted, in words."""
-    if not (isinstance(found, list) and isinstance(expected, list)):
-        return _text(found), f"{_text(expected)}, as in {reference}"
-    missing, more = ([x for x in a if x not in b] for a, b in ((expected, found), (found, expected)))
+    if not (isinstance(actual, list) and isinstance(expected, list)):
+        return _text(actual), f"{_text(expected)}, as in {reference}"
+    missing, more = ([x for x in a if x not in b] for a, b in ((expected, actual), (actual, expected)))
     texts = [f"{what} {join_names(names)}" for what, names in (("without", missing), ("with", more)) if names]
     return " and ".join(texts) or "another order", f"those of {reference}: {join_names(expected) or 'none'}"
 
@@ -198,11 +198,11 @@ def _text(value: Value) -> str:
     return "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _where(name: str, found: Array, expected: Array, model: RowModel) -> str:
+def _where(name: str, actual: Array, expected: Array, model: RowModel) -> str:
     """Which part of a robot differs, and by how much."""
-    if found.shape != expected.shape:
-        return f"{name} of shape {found.shape}"
-    apart = np.abs(found - expected).reshape(len(expected), -1).max(axis=1)
+    if actual.shape != expected.shape:
+        return f"{name} of shape {actual.shape}"
+    apart = np.abs(actual - expected).reshape(len(expected), -1).max(axis=1)
     worst = int(apart.argmax())
     if "contact" in name:
         contacts = model.settings["contacts"]
@@ -271,20 +271,20 @@ class _PartReader:
         if any(len(set(x)) != len(x) or max(x, default=0) >= columns for x in self._supports):
             raise ValueError(f"columns that are not among {columns}")
 
-    def read(self, one: _Part, unloaded: bool = False) -> Part:
+    def read(self, part: _Part, unloaded: bool = False) -> Part:
         """The next part."""
-        if len(one.state) != self._contacts or (unloaded and one.samples):
+        if len(part.state) != self._contacts or (unloaded and part.samples):
             raise ValueError("a part of other contacts or samples")
-        if not one.independent_rows <= one.rows or (one.rows and not one.independent_rows):
-            raise ValueError(f"{one.independent_rows:g} independent of {one.rows} rows")
-        blocks = {self._supports[number]: self._block(number, rows) for number, rows in one.blocks}
-        halves = {self._supports[n]: self._block(n, len(self._supports[n]) + 1) for n in one.noise_gram}
-        if len(blocks) != len(one.blocks) or len(halves) != len(one.noise_gram):
+        if not part.independent_rows <= part.rows or (part.rows and not part.independent_rows):
+            raise ValueError(f"{part.independent_rows:g} independent of {part.rows} rows")
+        blocks = {self._supports[number]: self._block(number, rows) for number, rows in part.blocks}
+        halves = {self._supports[n]: self._block(n, len(self._supports[n]) + 1) for n in part.noise_gram}
+        if len(blocks) != len(part.blocks) or len(halves) != len(part.noise_gram):
             raise ValueError("the same columns twice")
         noise_gram = {support: half + half.triu(1).T for support, half in halves.items()}
-        factor = TriangularFactor(self._columns, one.rows, one.independent_rows, blocks, noise_gram)
-        state = tuple(digit == "1" for digit in one.state)
-        return Part(self._source, state, factor, one.samples, unloaded=unloaded, masked=set(one.masked))
+        factor = TriangularFactor(self._columns, part.rows, part.independent_rows, blocks, noise_gram)
+        state = tuple(digit == "1" for digit in part.state)
+        return Part(self._source, state, factor, part.samples, unloaded=unloaded, masked=set(part.masked))
 
     def _block(self, number: int, rows: int) -> torch.Tensor:
         """The next triangle, or rows too few to make one, in some columns and the right-hand side."""
@@ -431,8 +431,8 @@ def read_factors(path: str | Path) -> FactorFile:
     path = Path(path)
     _require_suffix(path)
     if not os.path.isfile(path):
-        found = "no such file" if not os.path.lexists(path) else "no regular file"
-        raise LogError(path, "file", found, _ACCEPTED)
+        reason = "no such file" if not os.path.lexists(path) else "no regular file"
+        raise LogError(path, "file", reason, _ACCEPTED)
     with about_file(path), reader_errors_explained("file", _ACCEPTED), open_npz(path) as container:
         sizes = container.declared_bytes()
         check_unpacked_size(path, sum(sizes.values()), path)
@@ -485,9 +485,9 @@ def _read(path: Path, container: Container) -> FactorFile:
     """The content of an open file; any exception where it is damaged."""
     text = _array(container, "description", np.uint8, 1).tobytes()
     document = json.loads(text)
-    found = document.get("format") if isinstance(document, dict) else None
-    if found != FORMAT:
-        version = "none" if found is None else f"{excerpt(str(found))}, of another version of torchid"
+    form = document.get("format") if isinstance(document, dict) else None
+    if form != FORMAT:
+        version = "none" if form is None else f"{excerpt(str(form))}, of another version of torchid"
         raise LogError.at_field("format", version, f"{FORMAT}, as torchid {__version__} writes it")
     description = _DESCRIPTION.validate_json(text)
     require_comparable([*description.noise.values()])
@@ -521,8 +521,8 @@ def _log(source: str, description: _Description, values: Array) -> CompressedLog
     samples = description.samples
     blocks = description.blocks
     parts = _PartReader(source, description, values)
-    pieces = [parts.read(one) for one in description.pieces]
-    by_state = [parts.read(one) for one in description.by_state]
+    pieces = [parts.read(piece) for piece in description.pieces]
+    by_state = [parts.read(piece) for piece in description.by_state]
     unloaded = {
         (start, stop): [parts.read(x, unloaded=True) for x in parts_in_air]
         for start, stop, parts_in_air in description.unloaded
@@ -622,10 +622,10 @@ def with_choices_of(model: RowModel, experiment: Experiment) -> Experiment:
     config = experiment.config
     labels = settings.get("actuators")
     kinds = {label.partition(" of ")[0] for label in labels} if isinstance(labels, list) else set[str]()
-    found: dict[str, Any] = {name: in_words(name) in kinds for name in ACTUATORS}
-    found |= {name: settings.get(f"actuators.{name}") for name in ("sign_width", "delay", "stiction", "stribeck")}
+    choices: dict[str, Any] = {name: in_words(name) in kinds for name in ACTUATORS}
+    choices |= {name: settings.get(f"actuators.{name}") for name in ("sign_width", "delay", "stiction", "stribeck")}
     known = config.actuators.known
-    chosen = {name: x or known[name] for name, x in found.items() if vars(config.actuators)[name] == AUTO}
+    chosen = {name: x or known[name] for name, x in choices.items() if vars(config.actuators)[name] == AUTO}
     read: dict[str, Any] = {
         name: settings.get(f"preprocessing.{name}")
         for name in ("cutoff_hz", "contact_margin_s")
@@ -663,8 +663,8 @@ def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) 
     seen: dict[str, Path] = {}
     for path, file in zip(paths, files, strict=True):
         if file.sha256 and file.sha256 in seen:
-            found = f"of the same log as {seen[file.sha256]} ({excerpt(file.name)})"
-            raise LogError(path, "sha256", found, "factors of every log once")
+            reason = f"of the same log as {seen[file.sha256]} ({excerpt(file.name)})"
+            raise LogError(path, "sha256", reason, "factors of every log once")
         seen[file.sha256] = path
 
 
@@ -673,6 +673,6 @@ def _require_stated_noise(experiment: Experiment, model: RowModel, path: Path) -
     stated = NoiseGroups.of(experiment.robot).values(experiment.noise)
     for name, value in model.noise.items():
         if noise_key(name) in experiment.config.sensors.noise.forces and abs(value - stated[name]) > 1e-9 * value:
-            found = f"{stated[name]:g}, but {value:g} in {path}"
+            reason = f"{stated[name]:g}, but {value:g} in {path}"
             accepted = f"{value:g}, or no such key, or the logs compressed with another"
-            raise ConfigError.at_field(f"{NOISE}.{name}", found, accepted)
+            raise ConfigError.at_field(f"{NOISE}.{name}", reason, accepted)

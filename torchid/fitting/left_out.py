@@ -55,7 +55,8 @@ Of 1e-3, 1e-2, 0.1 and 1 the one that predicts strangers' logs best, or within 3
 SAMPLES = 6000
 """Samples of all logs, evenly spaced, that choices are made with."""
 
-_BLOCKS, _FOLDS = 20, 5
+_BLOCKS = 20
+_FOLDS = 5
 _LEAST_PER_BLOCK = 10  # independent samples
 _CHANCE = 0.005  # that a block-by-block difference of nothing seems to be one
 _GAIN = 0.1  # decrease of the squared error, at least: gains 2 % off let springs and offsets reach 0.05 where none are
@@ -240,10 +241,10 @@ def compress_reading(
     return Reading(grams, rows, oversampling, nominal[shared_columns], spread[shared_columns], shared, gain)
 
 
-def _eliminated(gram: Array, own: Sequence[int], rest: Sequence[int]) -> Array:
+def _eliminated(gram: Array, kept: Sequence[int], unknown: Sequence[int]) -> Array:
     """What is left of a Gram matrix where unknowns of its log alone are at their best."""
-    across = gram[np.ix_(own, rest)]
-    return np.asarray(gram[np.ix_(rest, rest)] - across.T @ np.linalg.pinv(gram[np.ix_(own, own)]) @ across)
+    across = gram[np.ix_(kept, unknown)]
+    return np.asarray(gram[np.ix_(unknown, unknown)] - across.T @ np.linalg.pinv(gram[np.ix_(kept, kept)]) @ across)
 
 
 def thinned(logs: Sequence[Samples], count: int = SAMPLES) -> list[Samples]:
@@ -365,10 +366,12 @@ class TermsChoice:
     rejected: Mapping[str, Evidence]
 
     def __str__(self) -> str:
-        near = {name: one for name, one in self.rejected.items() if one.certain and one.gain > 0.0}
-        named, misses = (", ".join(f"{in_words(name)} {one}" for name, one in x.items()) for x in (self.adopted, near))
-        of = " (error on left-out blocks)" * bool(named or misses)
-        return (named or "none") + (f"; near misses: {misses}" if misses else "") + of
+        near = {name: gain for name, gain in self.rejected.items() if gain.certain and gain.gain > 0.0}
+        named, misses = (
+            ", ".join(f"{in_words(name)} {gain}" for name, gain in x.items()) for x in (self.adopted, near)
+        )
+        suffix = " (error on left-out blocks)" * bool(named or misses)
+        return (named or "none") + (f"; near misses: {misses}" if misses else "") + suffix
 
 
 def choose_terms(reading: Reading, candidates: Sequence[str], fixed: Collection[str] = ()) -> TermsChoice:
@@ -487,7 +490,8 @@ RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
 STRONGER = (1.0, 10.0, 100.0)
 """Multiples of the ridge by the size of the residuals that are tried."""
 
-MOST_SCORED, ENOUGH_SCORED = 100_000, 10_000
+MOST_SCORED = 100_000
+ENOUGH_SCORED = 10_000
 """Samples of training logs, evenly spread, that errors of forces are computed of at most, and that are enough of them.
 Of a filtered log one in `oversampling` has the whole band of the errors' squares, and so their mean: one in 6 of
 60,000, 8700 of them independent, gives errors within 0.1 % of those of all, which chance alone changes by 0.8 %.
@@ -658,8 +662,8 @@ def _held_out_squares(
 
 
 def _too_few(logs: Sequence[Block]) -> LogError:
-    found = "the training samples are too few to leave blocks of them out"
-    return LogError(logs[0].source if logs else "logs", "samples", found, "longer logs")
+    reason = "the training samples are too few to leave blocks of them out"
+    return LogError(logs[0].source if logs else "logs", "samples", reason, "longer logs")
 
 
 @dataclass(frozen=True)
@@ -752,10 +756,14 @@ class Scorer:
 
         Empty without samples.
         """
-        rows, (first, *_) = self.evaluation.robot.n_rows, compared.values()
+        rows = self.evaluation.robot.n_rows
+        (first, *_) = compared.values()
         if not logs:
             return [(ForceSums(rows), ForceSums(rows)) for _ in first]
-        phi = {fold: np.stack([x.parameters(self.evaluation) for x in own]) for fold, own in compared.items()}
+        phi = {
+            fold: np.stack([x.parameters(self.evaluation) for x in calibrations_of_fold])
+            for fold, calibrations_of_fold in compared.items()
+        }
         if not first[0].changes_readings:
             measured, *errors = self.evaluation.force_sums([log.every(step) for log in logs], phi, progress)
             return [(ForceSums.total([measured]), error) for error in errors]
@@ -765,8 +773,8 @@ class Scorer:
             with warnings.catch_warnings():
                 if not identified:
                     warnings.simplefilter("ignore", TorchidWarning)
-                readings = [one for log in logs for one in compared[log.fold][number].calibrate([log], step)]
-            of_one = {fold: own[number : number + 1] for fold, own in phi.items()}
+                readings = [reading for log in logs for reading in compared[log.fold][number].calibrate([log], step)]
+            of_one = {fold: calibrations_of_fold[number : number + 1] for fold, calibrations_of_fold in phi.items()}
             measured, error = self.evaluation.force_sums(readings, of_one, progress if identified else None)
             pairs.append((measured, error))
         return pairs

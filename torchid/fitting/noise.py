@@ -148,7 +148,7 @@ def estimate_noise(
     )
     kept = {name: x for name, x in builder.noise_groups.values(guess).items() if noise_key(name) in stated}
     groups = _listed(rows, tied, used, free)
-    noise = builder.noise_groups.noise(kept | {one.group: one.used for one in groups}, guess)
+    noise = builder.noise_groups.noise(kept | {group.group: group.used for group in groups}, guess)
     return NoiseSummary(noise, groups, _suggested(rows, tied, free), passes)
 
 
@@ -317,9 +317,9 @@ class Misfit:
             return ""
         share = self.expected or 1.0
         shown = [
-            f"{one.group} {one.residual:.2g} {one.unit} where {share * one.used:.2g} are expected"
-            for one in self.groups
-            if one.residual is not None
+            f"{group.group} {group.residual:.2g} {group.unit} where {share * group.used:.2g} are expected"
+            for group in self.groups
+            if group.residual is not None
         ]
         where = f"; most in {', '.join(shown[:_NAMED])}" if shown else ""
         return f"{' and '.join(reasons)}{where}"
@@ -365,8 +365,8 @@ def misfit(
 def beyond_noise(estimate: Estimate) -> str:
     """That a fit leaves far more than the stated noise, far more than a `Misfit` says; "" where it does not."""
     residual = _residual(estimate)
-    found = f"forces differ from any rigid-body model by {residual:.3g} times the stated sensor noise"
-    return found if residual > _UNEXPLAINED else ""
+    reason = f"forces differ from any rigid-body model by {residual:.3g} times the stated sensor noise"
+    return reason if residual > _UNEXPLAINED else ""
 
 
 def unexplained_forces(

@@ -92,16 +92,16 @@ def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPo
     A, b = whitened_rows(problem, noise, deviations, reported)
     D = np.zeros((len(A), 0))
     extras = []
-    for one in fit.assembly.eliminations:
-        if one.log:
+    for x in fit.assembly.eliminations:
+        if x.log:
             continue
-        extras = list(one.extras)
-        noise_of_rows = max(noise, 1e-8 * float(np.linalg.norm(one.z)) / max(len(one.z), 1) ** 0.5, 1e-300)
-        A = np.concatenate([A, one.C[:, : len(problem.nominal)] / noise_of_rows])
-        D = np.concatenate([np.zeros((len(D), len(extras))), np.linalg.pinv(one.inverse) / noise_of_rows])
-        b = np.concatenate([b, one.z / noise_of_rows])
+        extras = list(x.extras)
+        noise_of_rows = max(noise, 1e-8 * float(np.linalg.norm(x.z)) / max(len(x.z), 1) ** 0.5, 1e-300)
+        A = np.concatenate([A, x.C[:, : len(problem.nominal)] / noise_of_rows])
+        D = np.concatenate([np.zeros((len(D), len(extras))), np.linalg.pinv(x.inverse) / noise_of_rows])
+        b = np.concatenate([b, x.z / noise_of_rows])
     joints = (body.joint for body in robot.bodies)
-    found = {one.extra.label: one.value for one in fit.extras if not one.log}
+    values_of_extras = {x.extra.label: x.value for x in fit.extras if not x.log}
     return FittedPosterior(
         posterior=Posterior(
             A=A,
@@ -111,7 +111,7 @@ def fitted_posterior(fit: Fit, robot: Robot, conditions: Conditions) -> FittedPo
             scale=_scale_of_prior(problem.scale, estimate.phi - problem.nominal),
             free=problem.free,
             conditions=conditions,
-            extra_size=np.array([max(extra.size, abs(found.get(extra.label, 0.0))) for extra in extras]),
+            extra_size=np.array([max(extra.size, abs(values_of_extras.get(extra.label, 0.0))) for extra in extras]),
             extra_lower=np.array([0.0 if extra.nonnegative else -np.inf for extra in extras]),
         ),
         body_names=tuple(robot.body_names),
@@ -151,13 +151,13 @@ def posterior_arrays(fitted: FittedPosterior) -> dict[str, NDArray[Any]]:
         "total_mass": np.array(np.nan if conditions.total_mass is None else conditions.total_mass),
         "lower": lower,
         "upper": upper,
-        "enclosure_body": np.array([one.body for one in enclosures], dtype=np.int64),
-        "enclosure_kind": np.array([one.kind for one in enclosures], dtype=np.str_),
-        "enclosure_centre": np.array([one.centre for one in enclosures]).reshape(-1, 3),
-        "enclosure_axes": np.array([one.axes for one in enclosures]).reshape(-1, 3, 3),
-        "enclosure_half": np.array([one.half for one in enclosures]).reshape(-1, 3),
-        "mirror_bodies": np.array([(one.body, one.image) for one in mirrors], dtype=np.int64).reshape(-1, 2),
-        "mirror_reflection": np.array([one.reflection for one in mirrors]).reshape(-1, 3, 3),
+        "enclosure_body": np.array([x.body for x in enclosures], dtype=np.int64),
+        "enclosure_kind": np.array([x.kind for x in enclosures], dtype=np.str_),
+        "enclosure_centre": np.array([x.centre for x in enclosures]).reshape(-1, 3),
+        "enclosure_axes": np.array([x.axes for x in enclosures]).reshape(-1, 3, 3),
+        "enclosure_half": np.array([x.half for x in enclosures]).reshape(-1, 3),
+        "mirror_bodies": np.array([(x.body, x.image) for x in mirrors], dtype=np.int64).reshape(-1, 2),
+        "mirror_reflection": np.array([x.reflection for x in mirrors]).reshape(-1, 3, 3),
     }
 
 
@@ -462,8 +462,8 @@ class RigidPlusResidual(nn.Module):
         except OSError:
             raise
         except Exception as error:  # noqa: B902 - an unpickler and torch raise what they like
-            found = f"not readable ({(str(error).splitlines() or [type(error).__name__])[0][:200]})"
+            reason = f"not readable ({(str(error).splitlines() or [type(error).__name__])[0][:200]})"
             raise InputError(
-                path, "file", found, "what RigidPlusResidual.save wrote, of this robot and module"
+                path, "file", reason, "what RigidPlusResidual.save wrote, of this robot and module"
             ) from error
         return cls(robot, phi, residual)

@@ -57,14 +57,14 @@ def conditions_from(settings: EstimatorConfig, robot: Robot) -> Conditions:
 def _enclosures(settings: EstimatorConfig, robot: Robot) -> tuple[Enclosure, ...]:
     if settings.com_inside is None:
         if settings.com_shapes != EstimatorConfig.com_shapes:
-            found = f"{settings.com_shapes}, without com_inside"
-            raise ConfigError.at_field("estimator.com_shapes", found, "com_inside: box or ellipsoid as well")
+            reason = f"{settings.com_shapes}, without com_inside"
+            raise ConfigError.at_field("estimator.com_shapes", reason, "com_inside: box or ellipsoid as well")
         return ()
     bodies = [i for i, body in enumerate(robot.bodies) if not body.massless and body.name not in settings.frozen]
     extents = body_extents(robot, settings.com_shapes, bodies)
     if not extents:
-        found = f"{settings.com_inside}, but {robot.path.name} says of no body that is fitted what shape it has"
-        raise ConfigError.at_field("estimator.com_inside", found, f"null, or a {robot.format} with shapes")
+        reason = f"{settings.com_inside}, but {robot.path.name} says of no body that is fitted what shape it has"
+        raise ConfigError.at_field("estimator.com_inside", reason, f"null, or a {robot.format} with shapes")
     out = []
     outside = []
     for body, extent in extents.items():
@@ -219,11 +219,11 @@ def _check_total(settings: EstimatorConfig, robot: Robot) -> None:
     held |= {name: mass.value for name, mass in settings.masses.items()}
     free = [body.name for body in robot.bodies if not body.massless and body.name not in held]
     if sum(held.values()) >= total.value:
-        found = f"{total.value:g} kg, of which {', '.join(held)} alone are {sum(held.values()):.4g} kg"
-        raise ConfigError.at_field(TOTAL, found, "the mass of the whole robot, as weighed")
+        reason = f"{total.value:g} kg, of which {', '.join(held)} alone are {sum(held.values()):.4g} kg"
+        raise ConfigError.at_field(TOTAL, reason, "the mass of the whole robot, as weighed")
     if not free:
-        found = f"{total.value:g} kg, with the mass of every body frozen or known"
-        raise ConfigError.at_field(TOTAL, found, "no such key, or a body whose mass is fitted")
+        reason = f"{total.value:g} kg, with the mass of every body frozen or known"
+        raise ConfigError.at_field(TOTAL, reason, "no such key, or a body whose mass is fitted")
 
 
 @one_thread()
@@ -252,10 +252,8 @@ def with_known_masses(
     if uncertain:
         free = problem.free
         scale = problem.scale[problem.free]
-        weights, (equations, missing) = (
-            noise / np.array([mass.std for mass in uncertain]),
-            _equations(problem, uncertain),
-        )
+        weights = noise / np.array([mass.std for mass in uncertain])
+        (equations, missing) = _equations(problem, uncertain)
         more = np.zeros((len(weights), len(free)))
         more[:, free] = weights[:, None] * equations / scale
         rows = np.concatenate([rows, more])

@@ -29,7 +29,8 @@ from torchid.problem import ExtraTerms, Samples, compress_parts
 from torchid.problem.compression import compress_in_blocks
 from torchid.problem.extras import SLOPE, dof_extra_column
 
-EARLIEST_DELAY, LATEST_DELAY = -0.02, 0.06
+EARLIEST_DELAY = -0.02
+LATEST_DELAY = 0.06
 """Delays that are tried [s]: beyond, the stamps are those of another clock."""
 
 LARGEST_TILT = 0.3
@@ -41,12 +42,19 @@ _VELOCITIES = tuple(10.0 ** np.arange(-2.0, 1.25, 0.25))  # [rad/s or m/s], of S
 _RADII = (0.0, 0.015, 0.03, 0.045)  # [m] of balls about the frames of feet
 _FIRST_WIDTHS = (0.01, 0.1)  # [rad/s or m/s]: where neither predicts better than the sign, no width is looked for
 
-_DELAY_TRIAL_SAMPLES, _TILT_SAMPLES, _SAMPLES = 1000, 2000, 5000  # of all logs, evenly spaced
+# of all logs, evenly spaced
+_DELAY_TRIAL_SAMPLES = 1000
+_TILT_SAMPLES = 2000
+_SAMPLES = 5000
 _WIDTH_GAIN = 0.05  # decrease of the squared error that a width is worth: no body can make up for it
 _TILT_GAIN = 1e-3  # of the residual, by which a tilt has to beat none
 _RIDGE = 1e-6  # the residual is smooth in the setting where the data determine some parameters badly
-_MAX_STEPS, _SETTLED_STEP = 8, 1e-2  # of Gauss and Newton; in standard errors
-_TILT_SETTLED, _WIDTH_SETTLED = 1e-6, 1e-3  # of the residual's square; of the logarithm to base 10
+# of Gauss and Newton; in standard errors
+_MAX_STEPS = 8
+_SETTLED_STEP = 1e-2
+# of the residual's square; of the logarithm to base 10
+_TILT_SETTLED = 1e-6
+_WIDTH_SETTLED = 1e-3
 _LOG_VELOCITY_STEP = 1e-3  # of differences
 _AT_REST_CHANCE = 0.025  # that friction at rest of any joint seems to be beyond Coulomb friction
 _QUANTILE = 1.96  # standard errors from the middle to the end of a 95 % interval
@@ -373,8 +381,8 @@ def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Tor
                 splines.append((torch.from_numpy(at), make_interp_spline(time[segment], recorded[segment], k=degree)))
         out.append(_Torques(samples, dofs, splines))
     if not out:
-        found = f"auto, but none is longer than the {LATEST_DELAY - EARLIEST_DELAY:g} s of delays that are tried"
-        raise LogError(logs[0].source if logs else "logs", "actuators.delay", found, "a number [s]")
+        reason = f"auto, but none is longer than the {LATEST_DELAY - EARLIEST_DELAY:g} s of delays that are tried"
+        raise LogError(logs[0].source if logs else "logs", "actuators.delay", reason, "a number [s]")
     return out
 
 

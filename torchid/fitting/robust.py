@@ -28,14 +28,18 @@ from torchid.rounding import MAD_PER_STD
 TUNING = {"huber": 1.345, "tukey": 4.685}
 """Tuning constants with 95 % efficiency on Gaussian noise; source: Huber, "Robust Statistics", 1981."""
 
-_DECADES, _BINS = (-12.0, 12.0), 4800  # of the histogram that the median of |residual| is read from: 1.2 % a bin
+# of the histogram that the median of |residual| is read from: 1.2 % a bin
+_DECADES = (-12.0, 12.0)
+_BINS = 4800
 _LEAST_SLOPE = 0.05  # mean of rho'' below which the loss is flat where the rows are: no standard error
 _CONVERGED = 0.03  # rms change of the predicted rows, in their standard errors
 _STEADY = 0.02  # relative change of the scale, whose histogram has bins of 1.2 %
 _EXACT = 1e-11  # of the predicted rows: less is rounding
 _TINY = float(np.finfo(float).tiny)
 _ROUGH_SAMPLES = 5000  # evenly spaced, at least, that a fit of longer logs starts from: 2 passes over all are left
-_ROUGH_STEP, _MOST_ROUGH = 8, 50_000  # one in so many, unless they are more than so many
+# one in so many, unless they are more than so many
+_ROUGH_STEP = 8
+_MOST_ROUGH = 50_000
 _LEAST_ROUGH = 200  # of them in each log, which may have unknowns of its own
 _WORTHWHILE = 4  # times as many samples, from which on that saves more than it costs
 _START = 3  # passes with Huber's loss before Tukey's

@@ -69,7 +69,8 @@ from torchid.sensing import Contact, SensorSet
 #: Share of rejected samples above which a log is not usable.
 MAX_REJECTED_SHARE = 0.5
 #: Descriptions and spans that one line of text lists.
-_MAX_LISTED_TEXTS, _MAX_LISTED_SPANS = 3, 4
+_MAX_LISTED_TEXTS = 3
+_MAX_LISTED_SPANS = 4
 _LONGEST_BRIDGED_S = 0.1  # half of the shortest period of a robot's motion, 5 Hz
 
 
@@ -95,10 +96,10 @@ class Checked:
 
     def _headline(self) -> str:
         counts = Counter(finding.severity for finding in self.findings)
-        found = (
+        headline = (
             ", ".join(f"{counts[severity]} {severity}" for severity in SEVERITIES if counts[severity]) or "no finding"
         )
-        return f"{log_title(self.log.source)}, {len(self.log)} samples, {self.verdict} ({found})"
+        return f"{log_title(self.log.source)}, {len(self.log)} samples, {self.verdict} ({headline})"
 
     @cached_property
     def rejected(self) -> BoolArray:
@@ -152,7 +153,8 @@ def check(
     """
     log, unclosed = completed(without_welded_joints(log, robot), robot)
     if any(contact.along_normal for contact in contacts):  # wrenches are what is checked
-        contacts, required = [replace(contact, along_normal=False) for contact in contacts], None
+        contacts = [replace(contact, along_normal=False) for contact in contacts]
+        required = None
     results: list[Finding | Skipped] = list(check_magnitudes(log))
     if (blocking := _blocking_finding(results)) is not None:
         return _collect(log, log, [*results, _skip_dependent(blocking)])
@@ -241,9 +243,11 @@ def _was_interpolated(finding: Finding | Skipped, missing: Sequence[Finding]) ->
 def _between_holes(log: Log, filled: BoolArray) -> Log:
     """The longest part of a repaired log without holes so long that what was `filled` in (N,) is no motion."""
     edges = np.flatnonzero(np.diff(filled, prepend=False, append=False))
-    first, last = edges[::2], edges[1::2]
+    first = edges[::2]
+    last = edges[1::2]
     long = log.time[last - 1] - log.time[first] > _LONGEST_BRIDGED_S
-    starts, ends = np.append(0, last[long]), np.append(first[long], len(log))
+    starts = np.append(0, last[long])
+    ends = np.append(first[long], len(log))
     best = int(np.argmax(ends - starts))
     return log.select(slice(starts[best], ends[best])) if starts[best] < ends[best] else log
 

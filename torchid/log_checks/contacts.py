@@ -42,10 +42,12 @@ from torchid.rounding import STD_PER_MAD
 from torchid.sensing import Contact, named_sensors
 
 #: Relative error of the carried mass that is noted, and that no CAD model has.
-MIN_NOTED_MASS_ERROR, MAX_MASS_ERROR = 0.02, 0.2
+MIN_NOTED_MASS_ERROR = 0.02
+MAX_MASS_ERROR = 0.2
 #: Rest that the check needs, or else the length of log over which it averages: a change of speed of 1 m/s between its
 #: ends is then 2 % of gravity.
-_MIN_REST_S, _MIN_AVERAGING_S = 0.5, 5.0
+_MIN_REST_S = 0.5
+_MIN_AVERAGING_S = 5.0
 #: Samples for which poses of contact frames are computed.
 _MAX_POSE_SAMPLES = 4000
 #: Relative error of an accelerometer at rest: a good one is within 0.5 %.
@@ -54,14 +56,16 @@ _MAX_ACCELEROMETER_ERROR = 0.02
 _ACCELEROMETER_UNIT_TOLERANCE = 0.1
 #: Mean of a reading without gravity, and its median size where nothing else says that the base does not turn over, over
 #: gravity.
-_MAX_MEAN_WITHOUT_GRAVITY, _MAX_SIZE_WITHOUT_GRAVITY = 0.1, 0.5
+_MAX_MEAN_WITHOUT_GRAVITY = 0.1
+_MAX_SIZE_WITHOUT_GRAVITY = 0.5
 #: Mean of the vertical along the axes of a base that does not turn over.
 _MIN_MEAN_VERTICAL = 0.7
 #: Mean along the world's axes over gravity below which it has no direction.
 _MIN_MEAN_WITH_DIRECTION = 0.5
 #: Angle between gravity by the accelerometer and by the orientation of the base.
 _MAX_TILT_DEG = 5.0
-_WEIGHT_CHECK, _ACCELEROMETER_CHECK = "weight at rest", "accelerometer at rest"
+_WEIGHT_CHECK = "weight at rest"
+_ACCELEROMETER_CHECK = "accelerometer at rest"
 
 
 def check_weight(log: Log, robot: Robot | None, scaled: bool = False) -> Iterator[Finding | Skipped]:
@@ -232,7 +236,8 @@ def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -
         return
     angles = np.degrees(np.arccos(np.clip(up / np.linalg.norm(up), -1.0, 1.0)))
     angle = float(angles[2])
-    name, text = "imu_specific_force", f"{angle:.3g} degrees from up {when}, by base_quat"
+    name = "imu_specific_force"
+    text = f"{angle:.3g} degrees from up {when}, by base_quat"
     if (level := int(np.argmin(angles))) < 2 and angles[level] < _MAX_TILT_DEG:
         advice = f"turn the world so that z points up; else check the IMU's frame in the {robot.format}"
         text = f"imu_specific_force {text}: a world whose {'xy'[level]} axis points up?"
@@ -260,7 +265,8 @@ def _height_above_feet(log: Log, robot: Robot, upward: FloatArray) -> float | No
         return None
     known = [index for index, name in enumerate(log.contact_names) if name in robot.links]
     samples = np.linspace(0, len(log) - 1, min(_MAX_POSE_SAMPLES, len(log))).astype(int)
-    poses, active = recorded_link_poses(log.select(samples), robot), log.contact_active[samples]
+    poses = recorded_link_poses(log.select(samples), robot)
+    active = log.contact_active[samples]
     mean = upward.mean(axis=0)
     heights = [-(poses[log.contact_names[k]][:, :3, 3].numpy() @ mean)[active[:, k]] for k in known]
     all_heights = np.concatenate(heights) if heights else np.zeros(0)
@@ -285,7 +291,9 @@ def _find_rest(log: Log) -> BoolArray:
         return still
     middle = np.ones(len(log) - 2 * half, bool)
     for values in _poses(log):
-        start, centre, end = values[: -2 * half], values[half:-half], values[2 * half :]
+        start = values[: -2 * half]
+        centre = values[half:-half]
+        end = values[2 * half :]
         for first, second in ((start, centre), (centre, end), (start, end)):
             middle &= (np.abs(first - second) < MAX_REST_MOTION).all(axis=1)
     if log.imu_angular_velocity is not None:
@@ -312,13 +320,17 @@ _MIN_STANDING_WEIGHT_SHARE = 0.5
 _MAX_UNLOADED_S = 0.1
 #: A reading in the air is an offset if it varies by at most this share, has enough samples, and is below this share of
 #: the usual load: above it, the foot stands.
-_MAX_OFFSET_SPREAD_SHARE, _MIN_OFFSET_SAMPLES, _MAX_OFFSET_LOAD_SHARE = 0.2, 10, 0.5
+_MAX_OFFSET_SPREAD_SHARE = 0.2
+_MIN_OFFSET_SAMPLES = 10
+_MAX_OFFSET_LOAD_SHARE = 0.5
 #: Share of its active samples in which a sensor reads other than 0 up to which it is dead: noise alone is not 0.
 _MOST_READ_OF_DEAD_SHARE = 0.01
 #: Delay of a flag against the force: its resolution, and the longest one.
-MIN_DELAY_SAMPLES, _MAX_DELAY_S = 2, 0.2
+MIN_DELAY_SAMPLES = 2
+_MAX_DELAY_S = 0.2
 #: Changes of a flag that a delay needs, and the share of them that must agree to `MIN_DELAY_SAMPLES`.
-_MIN_CHANGES, _MIN_AGREEING_SHARE = 3, 0.7
+_MIN_CHANGES = 3
+_MIN_AGREEING_SHARE = 0.7
 _FLAG_CHECK = "contact flags against forces"
 
 
@@ -364,7 +376,8 @@ def _contacts(log: Log) -> Iterator[_Contact]:
     if wrench is None or log.contact_active is None:
         return
     for index, name in enumerate(log.contact_names):
-        force, active = wrench[:, index, :3], log.contact_active[:, index]
+        force = wrench[:, index, :3]
+        active = log.contact_active[:, index]
         measured = np.asarray(np.isfinite(force).all(axis=1))
         if measured.any() and measured[active].all():
             yield _Contact(name, active, np.where(measured[:, None], force, np.nan))
@@ -404,7 +417,8 @@ def _offset(contact: _Contact) -> FloatArray:
     if len(air) < _MIN_OFFSET_SAMPLES or not contact.active.any():
         return np.zeros(3)
     offset = np.median(air, axis=0)
-    size, load = float(np.linalg.norm(offset)), float(np.median(np.linalg.norm(contact.force[contact.active], axis=1)))
+    size = float(np.linalg.norm(offset))
+    load = float(np.median(np.linalg.norm(contact.force[contact.active], axis=1)))
     constant = _spread(air - offset) < _MAX_OFFSET_SPREAD_SHARE * size
     return offset if constant and size < _MAX_OFFSET_LOAD_SHARE * load else np.zeros(3)
 
@@ -469,7 +483,8 @@ def _delay_findings(log: Log, contact: _Contact, size: FloatArray, weight: float
 
 def check_scalar_wrenches(log: Log) -> Iterator[Finding]:
     """Findings about wrenches of which one force alone is ever other than 0: a scalar sensor's reading among zeros."""
-    wrench, active = log.contact_wrench, log.contact_active
+    wrench = log.contact_wrench
+    active = log.contact_active
     if wrench is None or active is None:
         return
     for index, name in enumerate(log.contact_names):
@@ -507,8 +522,10 @@ def check_slip(
     if derived:
         return
     cutoff_hz = cutoff_hz or default_cutoff_hz(log)
-    slips, checked = np.zeros((len(log), len(contacts)), dtype=bool), False
-    standing, fastest = np.zeros(len(contacts)), np.zeros(len(contacts))
+    slips = np.zeros((len(log), len(contacts)), dtype=bool)
+    checked = False
+    standing = np.zeros(len(contacts))
+    fastest = np.zeros(len(contacts))
     for start in range(0, len(log), MAX_DIFFERENTIATED_SAMPLES):
         part = log.select(slice(start, start + MAX_DIFFERENTIATED_SAMPLES))
         try:
@@ -542,7 +559,8 @@ _MIN_CORRELATION = 0.9
 #: told from a mass: noise of accelerations makes the mass too small and an offset of the rest, which leave 0.85 of it.
 _MAX_OFFSET_RESIDUAL = 0.5
 #: Misfit of a sensor's forces that loads and offsets do not make, and the share of it that another frame may leave.
-_MIN_FRAME_MISFIT, _MAX_TURNED_SHARE = 0.7, 0.35
+_MIN_FRAME_MISFIT = 0.7
+_MAX_TURNED_SHARE = 0.35
 _LIMB_SENSOR_CHECK = "limb sensors in the air"
 
 
@@ -564,7 +582,8 @@ def check_limb_sensors(
         if name not in log.ft_names:
             continue
         force = slice(robot.base_rows + robot.n + 6 * number, robot.base_rows + robot.n + 6 * number + 3)
-        measured, model = measured_series[:, force], model_series[:, force]
+        measured = measured_series[:, force]
+        model = model_series[:, force]
         beyond = _contacts_beyond(robot, contacts, name)
         air = ~active[:, beyond].any(axis=1) & np.isfinite(measured).all(axis=1)
         if not beyond and not robot.fixed_base and not contacts:
@@ -588,14 +607,15 @@ def _turned_sensor(measured: FloatArray, model: FloatArray) -> str | None:
         return float(np.linalg.norm(forces - model)) / max(float(np.linalg.norm(model)), 1e-9)
 
     as_read = misfit(measured)
-    left, words = min((misfit(measured @ R.T), words) for words, R in quarter_turns())
-    return words if as_read > _MIN_FRAME_MISFIT and left < _MAX_TURNED_SHARE * as_read else None
+    unexplained, words = min((misfit(measured @ R.T), words) for words, R in quarter_turns())
+    return words if as_read > _MIN_FRAME_MISFIT and unexplained < _MAX_TURNED_SHARE * as_read else None
 
 
 def _limb_sensor_findings(name: str, measured: FloatArray, model: FloatArray, robot: Robot) -> Iterator[Finding]:
     """Findings about measured forces (M, 3) of a sensor against those of the URDF's bodies, (M, 3)."""
     weight = float(np.linalg.norm(model.mean(axis=0)))
-    x, y = model - model.mean(axis=0), measured - measured.mean(axis=0)
+    x = model - model.mean(axis=0)
+    y = measured - measured.mean(axis=0)
     product = float((x * y).sum())
     correlated = abs(product) > _MIN_CORRELATION * np.linalg.norm(x) * np.linalg.norm(y)
     if not correlated and (turned := _turned_sensor(measured, model)) is not None:
@@ -614,7 +634,8 @@ def _limb_sensor_findings(name: str, measured: FloatArray, model: FloatArray, ro
         yield Finding("weight", SUSPICIOUS, "ft_wrench", text, advice, (name,))
     residual = measured - gain * model
     offset = np.median(residual, axis=0)
-    size, spread = float(np.linalg.norm(offset)), _spread(residual - offset)
+    size = float(np.linalg.norm(offset))
+    spread = _spread(residual - offset)
     threshold = MIN_ACTIVE_WEIGHT_SHARE * GRAVITY * float(robot.nominal[:, 0].sum())
     mass_alone = measured - (measured.mean(axis=0) @ model.mean(axis=0)) / max(weight, 1e-9) ** 2 * model
     separate = correlated and np.square(residual - offset).sum() < _MAX_OFFSET_RESIDUAL * np.square(mass_alone).sum()

@@ -38,16 +38,21 @@ JOINT_TERM_SCALE = 3.0
 #: The same of armature: a geared motor's inertia may be all of the torque in light limbs.
 ARMATURE_SCALE = 1.0 / UNMODELLED_FORCE_SHARE
 #: Prior of declared terms, over their usual size; of declared scales; of those of torques as large as required.
-DECLARED_SIZES, DECLARED_SCALE, SCALED_TORQUE_STD = 10.0, 10.0, 0.3
+DECLARED_SIZES = 10.0
+DECLARED_SCALE = 10.0
+SCALED_TORQUE_STD = 0.3
 #: Successive samples that count as one: of 240 out of ten seconds, errors of friction and flexibility are correlated.
 CORRELATED_SAMPLES = 10.0
 #: Samples of a log whose forces are compared, and blocks of time whose estimates must agree.
-COMPARED_SAMPLES, TIME_BLOCKS = 240, 6
+COMPARED_SAMPLES = 240
+TIME_BLOCKS = 6
 #: Share of an estimate that every block of time must show, and its least size in standard deviations: by chance alone
 #: one in 2000 is larger, or one in a hundred logs of twenty unknowns.
-MIN_BLOCK_SHARE, MIN_STANDARD_DEVIATIONS = 0.5, 3.5
+MIN_BLOCK_SHARE = 0.5
+MIN_STANDARD_DEVIATIONS = 3.5
 #: Samples that are differentiated: all of a short log, `PIECES` evenly spread runs of a long one.
-MAX_DIFFERENTIATED_SAMPLES, PIECES = 10_000, 4
+MAX_DIFFERENTIATED_SAMPLES = 10_000
+PIECES = 4
 #: Torque below the resolution of any sensor.
 MIN_TORQUE_NM = 1e-9
 _TINY = 1e-12
@@ -246,9 +251,9 @@ class ReducedEquations:
         inverse = np.linalg.inv(G[:, 1:, 1:] + precision)
         x = np.einsum("bij,bj->bi", inverse, G[:, 1:, 0])
         squares = G[0, 0, 0] - 2.0 * G[0, 0, 1:] @ x[0] + x[0] @ G[0, 1:, 1:] @ x[0]
-        left = self._rms(float(squares))
-        spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, left**2) * np.diag(inverse[0]))
-        return Estimate(x[0], spread, x[1:], self.left, left)
+        unexplained = self._rms(float(squares))
+        spread = np.sqrt(CORRELATED_SAMPLES * max(1.0, unexplained**2) * np.diag(inverse[0]))
+        return Estimate(x[0], spread, x[1:], self.left, unexplained)
 
     def select(self, which: NDArray[np.intp]) -> ReducedEquations:
         """Equations of some of the unknowns."""

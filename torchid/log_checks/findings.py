@@ -96,12 +96,14 @@ _EXPLAINING_SHARE = 0.05  # of the samples, on which a finding may be the reason
 def explained(findings: Sequence[Finding], samples: int) -> list[Finding]:
     """Findings of which those that name no mistake refer to others beside them that do."""
     named = [
-        f"{one.name} of {one.field}"
-        for one in findings
-        if one.severity != NOTE and UNEXPLAINED not in one.found and one.mask(samples).mean() > _EXPLAINING_SHARE
+        f"{finding.name} of {finding.field}"
+        for finding in findings
+        if finding.severity != NOTE
+        and UNEXPLAINED not in finding.found
+        and finding.mask(samples).mean() > _EXPLAINING_SHARE
     ]
     see = f"; see {join_names(named, _FEW_NAMED)}" if named else UNEXPLAINED
-    return [replace(one, found=one.found.replace(UNEXPLAINED, see)) for one in findings]
+    return [replace(finding, found=finding.found.replace(UNEXPLAINED, see)) for finding in findings]
 
 
 def refused(error: InputError) -> Finding:
@@ -240,11 +242,11 @@ def channel_groups(log: Log, fields: Sequence[str] | None = None) -> Iterator[Ch
             continue
         for index, label in enumerate(column_labels(field, log.names)):
             measured = np.ones(len(log), dtype=bool)
-            own = values[:, index].reshape(len(log), -1)
+            channel = values[:, index].reshape(len(log), -1)
             if field in CONTACT_READINGS and log.contact_active is not None:
-                measured = log.contact_active[:, index] & (own != 0.0).any(axis=1)
-            width = own.shape[1]
-            yield from _group(log, field, label, names[width * index : width * (index + 1)], own, measured)
+                measured = log.contact_active[:, index] & (channel != 0.0).any(axis=1)
+            width = channel.shape[1]
+            yield from _group(log, field, label, names[width * index : width * (index + 1)], channel, measured)
 
 
 def _group(

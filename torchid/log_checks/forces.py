@@ -62,19 +62,25 @@ _ALIKE_RATIO = 1.1
 #: Evenly spread samples of each corrected log.
 TRIAL_SAMPLES = 120
 #: Samples of each contact state whose rank is counted, and states that a finding names.
-_RANK_SAMPLES, _NAMED = 60, 3
+_RANK_SAMPLES = 60
+_NAMED = 3
 #: Factor of time that no error of inertias explains: its square is 2.25.
 MIN_TIME_FACTOR = 1.5
 #: Factors of time that are tried, and that at which accelerations vanish.
-_TIME_FACTORS, _REST_FACTOR = np.geomspace(1e-4, 1e4, 1601), 1e4
+_TIME_FACTORS = np.geomspace(1e-4, 1e4, 1601)
+_REST_FACTOR = 1e4
 #: Unexplained forces with the recorded time, or at rest, over those with the corrected time; the same where that leaves
 #: more than `_MAX_LEFT_BY_TIME`: an arm with a tool of 2.5 kg that its URDF does not have is explained half as badly by
 #: 0.66 times the time.
-_MIN_TIME_RATIO, _MIN_TIME_RATIO_OF_ANOTHER_ROBOT = 1.5, 10.0
+_MIN_TIME_RATIO = 1.5
+_MIN_TIME_RATIO_OF_ANOTHER_ROBOT = 10.0
 _TIME_UNITS = {60.0: "minutes", 1e-3: "ms", 1e3: "ks", 3600.0: "hours"}
 #: Share of the power of positions within the bandwidth of the motion, the cutoff over that bandwidth, its minimum in
 #: periods per log (the filter spoils two at each end), and its maximum over the sample rate.
-_MOTION_POWER_SHARE, _CUTOFF_BANDWIDTHS, _MIN_CUTOFF_PERIODS, _MAX_CUTOFF_RATE_SHARE = 0.99, 6.0, 20.0, 0.2
+_MOTION_POWER_SHARE = 0.99
+_CUTOFF_BANDWIDTHS = 6.0
+_MIN_CUTOFF_PERIODS = 20.0
+_MAX_CUTOFF_RATE_SHARE = 0.2
 #: What dry friction may carry of the largest load where a joint stands still.
 MAX_FRICTION_SHARE = 0.2
 #: Share of what is unexplained that the torque of a joint that stands still must make up.
@@ -84,11 +90,14 @@ _MIN_FRICTION_RATIO = 2.0
 #: Largest moment of inertia over the sum of all three: plates have 0.5, and files round.
 _MAX_MOMENT_SHARE = 0.51
 #: Density of a ball of the same mass and radius of gyration [kg/m^3]: less than of air, more than of lead or tungsten.
-_MIN_DENSITY, _MAX_DENSITY = 1.0, 20_000.0
+_MIN_DENSITY = 1.0
+_MAX_DENSITY = 20_000.0
 #: Volume of a ball over the third power of its radius of gyration.
 _BALL_VOLUME = 4.0 / 3.0 * np.pi * (5.0 / 3.0) ** 1.5
 #: Share of the robot's mass below which bodies are not looked at, and number of bodies that may be alike.
-_MIN_MASS_SHARE, _MIN_BODIES, _TINY = 1e-4, 4, 1e-9
+_MIN_MASS_SHARE = 1e-4
+_MIN_BODIES = 4
+_TINY = 1e-9
 #: Range of the moments of inertia of a body, over the largest, that counts as rounding.
 _EQUAL_MOMENTS = 1e-6
 _FORCE_CHECK = "forces against the model"
@@ -461,16 +470,19 @@ def _time_scale(log: Log, model: NominalModel) -> Explanation | None:
     cost = np.einsum("ks,bkl,ls->bs", u, products, u)
     best = int(np.argmin(cost[0]))
     unity = int(np.argmin(np.abs(np.log(_TIME_FACTORS))))
-    left = np.sqrt(np.maximum(cost[0], 0.0) / max(equations.rows, 1))
+    unexplained = np.sqrt(np.maximum(cost[0], 0.0) / max(equations.rows, 1))
     factor = float(_TIME_FACTORS[best])
     blocks = _TIME_FACTORS[np.argmin(cost[1:], axis=1)]
     agree = np.log(blocks) * np.sign(np.log(factor)) > MIN_BLOCK_SHARE * abs(np.log(factor))
-    ratio = min(left[unity], left[-1]) / max(left[best], 1e-9)
-    makes_up = left[best] <= _MAX_LEFT_BY_TIME or left[unity] >= _MIN_TIME_RATIO_OF_ANOTHER_ROBOT * left[best]
+    ratio = min(unexplained[unity], unexplained[-1]) / max(unexplained[best], 1e-9)
+    makes_up = (
+        unexplained[best] <= _MAX_LEFT_BY_TIME
+        or unexplained[unity] >= _MIN_TIME_RATIO_OF_ANOTHER_ROBOT * unexplained[best]
+    )
     if abs(np.log(factor)) < np.log(MIN_TIME_FACTOR) or not agree.all() or ratio < _MIN_TIME_RATIO or not makes_up:
         return None
     units = [name for size, name in _TIME_UNITS.items() if abs(factor / size - 1.0) < 0.1]
     text = f"gravity and inertia make up the measured forces if time is multiplied by {factor:.3g}"
     advice = "give seconds; check the sample rate that the stamps were made from"
     finding = Finding("unit", REJECTED, "time", f"in {units[0]}: {text}" if units else text, advice)
-    return Explanation([finding], float(left[best]), 1, np.array([factor]))
+    return Explanation([finding], float(unexplained[best]), 1, np.array([factor]))

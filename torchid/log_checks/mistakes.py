@@ -109,8 +109,8 @@ def joint_orders(robot: Robot) -> dict[str, tuple[str, ...]]:
 
     out = {}
     for by_name in (False, True):
-        found: dict[str, list[int]] = {"depth": [], "breadth": []}
-        for kind, order in found.items():
+        orders: dict[str, list[int]] = {"depth": [], "breadth": []}
+        for kind, order in orders.items():
             waiting = [0]
             while waiting:
                 body = waiting.pop(0)
@@ -159,7 +159,8 @@ def exchanged_in_limbs(names: Sequence[str], robot: Robot | None) -> Iterator[tu
     if robot is None or set(names) != set(robot.joint_names):
         return
     for body in robot.bodies:
-        above, apart = body.parent, 0
+        above = body.parent
+        apart = 0
         while body.joint is not None and body.joint.name in names and above > 0 and apart < _MOST_APART:
             joint = robot.bodies[above].joint
             if joint is not None and joint.name in names:
@@ -268,7 +269,8 @@ def _orientation_mistakes() -> Iterator[Mistake]:
     for axis_points, quarters in _WORLDS.items():
         turned_up = _turn_world(Rotation.from_rotvec(0.5 * np.pi * np.array(quarters)))
         yield Mistake("base_quat_xyzw", f"in a world whose {axis_points}", up, turned_up)
-    order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
+    order = "w first against w last is mixed up"
+    rename = "rename base_quat_wxyz and base_quat_xyzw"
     yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, -1, axis=1)))
     yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, 1, axis=1)))
     yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _with_quaternions(inverse_rotation))
@@ -278,7 +280,8 @@ def _orientation_mistakes() -> Iterator[Mistake]:
     yield Mistake("base_quat_xyzw", downward, forward, _turn_base)
     yield Mistake("base_quat_xyzw", downward, forward, lambda log: _turn_base(turn_world(log)))
     for axis, name in enumerate("xyz"):
-        mirrored, turn = f"in a left-handed world, whose {name} axis is reversed", "give a right-handed world's"
+        mirrored = f"in a left-handed world, whose {name} axis is reversed"
+        turn = "give a right-handed world's"
         yield Mistake("base_quat_xyzw", mirrored, f"{turn} orientations and vectors", _mirror_world(axis))
 
 
@@ -317,7 +320,8 @@ def joint_mistakes(log: Log) -> Iterator[Mistake]:
         yield Mistake("joint_position", f"{name} reversed", flip, _flip_joint(joint, _JOINT_MOTION), True, True)
         yield Mistake("joint_position", f"{name} reversed, with its torque", flip, _flip_joint(joint, both), True, True)
         for degrees in (90, -90, 180):
-            text, advice = f"{name} read from another zero", f"add {degrees} degrees to its positions"
+            text = f"{name} read from another zero"
+            advice = f"add {degrees} degrees to its positions"
             yield Mistake("joint_position", text, advice, _shift_joint(joint, np.radians(degrees)), True, True)
 
 

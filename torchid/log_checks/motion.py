@@ -114,7 +114,8 @@ def compare_derivative(
     excess = (given[at] - true[at]).mean(axis=0) / (lag * step) ** order
     target = true[at] - true[at].mean(axis=0)
     size = np.square(target).sum(axis=0)
-    products, misfits = [], []
+    products = []
+    misfits = []
     for shift in range(-MAX_DELAY_SAMPLES, MAX_DELAY_SAMPLES + 1):
         shifted = given[at + shift] - given[at + shift].mean(axis=0)
         products.append(((target * shifted).sum(axis=0), np.square(shifted).sum(axis=0)))
@@ -162,7 +163,8 @@ MAX_RATIO_ERROR = 0.15
 #: Correlation of a derivative with that of its base.
 MIN_CORRELATION = 0.9
 #: Misfit above which other frames and orders are tried, and the share of it that the right one may leave.
-MAX_MISFIT, MAX_DERIVATIVE_RESIDUAL_SHARE = 0.15, 0.3
+MAX_MISFIT = 0.15
+MAX_DERIVATIVE_RESIDUAL_SHARE = 0.3
 _TINY = 1e-300
 _DERIVATIVE_CHECK = "velocities and accelerations against positions"
 
@@ -317,10 +319,8 @@ def _mistakes(quat: FloatArray, omega: FloatArray) -> Iterator[_Mistake]:
     frame = "fits in the {} frame, not in the {} frame"
     yield _Mistake(frame.format("world", "base"), "call it ..._world", "", quat, rotate_to_base(quat, omega))
     yield _Mistake(frame.format("base", "world"), "call it ..._base", "", quat, rotate_to_world(quat, omega))
-    order, rename = (
-        "the order of the components is mistaken: w first against w last",
-        "rename base_quat_wxyz and base_quat_xyzw",
-    )
+    order = "the order of the components is mistaken: w first against w last"
+    rename = "rename base_quat_wxyz and base_quat_xyzw"
     for shift in (1, -1):
         rolled = make_sign_continuous(np.roll(quat, shift, axis=1))
         yield _Mistake(order, rename, "base_quat_xyzw", rolled, omega)
@@ -336,11 +336,13 @@ def _best_mistake(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit:
 
     Several may explain it: the inverse and the reversed orientation are nearly equal for a base that turns little.
     """
-    best, least = None, MAX_DERIVATIVE_RESIDUAL_SHARE * misfit
+    best = None
+    least = MAX_DERIVATIVE_RESIDUAL_SHARE * misfit
     for mistake in _mistakes(quat, omega):
         trial = compare_derivative(time, _integrate(time, _omega(time, mistake.quat)), mistake.omega)
         if trial is not None and trial.misfit < least:
-            best, least = mistake, trial.misfit
+            best = mistake
+            least = trial.misfit
     return best
 
 
@@ -403,8 +405,8 @@ def same_poses(log: Log, other: Log, robot: Robot, links: Sequence[str]) -> bool
     names = [robot.joint_names[joint] for joint in joints]
     if not set(names) <= set(log.joint_names) & set(other.joint_names):
         return False
-    own, theirs = (x.joint_position[:, [x.joint_names.index(name) for name in names]] for x in (log, other))
-    return np.array_equal(own, theirs)
+    positions, theirs = (x.joint_position[:, [x.joint_names.index(name) for name in names]] for x in (log, other))
+    return np.array_equal(positions, theirs)
 
 
 #: Time over which positions are averaged, and velocities added up: a tenth of a second resolves motion up to 5 Hz.
@@ -412,7 +414,8 @@ _AVERAGED_S = 0.1
 #: Largest range of averages of white noise, in their standard deviations, in a thousand of them.
 _NOISE_RANGE = 8.0
 #: Travel by a joint's velocity over its noise, and over that of its position, from which on it moves.
-_MIN_TRAVEL_TO_NOISE, _MIN_TRAVEL_RATIO = 20.0, 10.0
+_MIN_TRAVEL_TO_NOISE = 20.0
+_MIN_TRAVEL_RATIO = 10.0
 
 
 def still_joints(log: Log) -> tuple[str, ...]:
@@ -432,7 +435,8 @@ def still_joints(log: Log) -> tuple[str, ...]:
 
 def check_still_velocities(log: Log) -> Iterator[Finding]:
     """A finding about joints whose velocities move them while their positions stand still."""
-    names, velocity = still_joints(log), log.joint_velocity
+    names = still_joints(log)
+    velocity = log.joint_velocity
     if not names or velocity is None:
         return
     step = float(np.median(np.diff(log.time)))

@@ -120,7 +120,8 @@ _TICKS_PER_S = {"ms": 1e3, "us": 1e6, "ns": 1e9}
 #: Rms jitter that is reported: 1e-3 of a step at 1 rad/s and 1 kHz is 1e-6 rad.
 MIN_JITTER_STEPS = 1e-3
 #: Change of a step, in rms deviations, at which motion and stamps are compared, and the samples that this needs.
-_MIN_DEVIATION_RMS, _MIN_COMPARED_SAMPLES = 3.0, 10
+_MIN_DEVIATION_RMS = 3.0
+_MIN_COMPARED_SAMPLES = 10
 #: Residual of positions with uniform stamps over that with the recorded stamps, below which the stamps jitter.
 _MAX_STAMP_RESIDUAL_SHARE = 0.5
 
@@ -137,7 +138,8 @@ def check_time_stamps(log: Log) -> Iterator[Finding]:
     median = float(np.median(steps))
     if median > MAX_MEDIAN_STEP_S:
         yield _unit_finding(median)
-    long, short = steps > MIN_GAP_STEPS * median, steps < SHORTEST_STEP * median
+    long = steps > MIN_GAP_STEPS * median
+    short = steps < SHORTEST_STEP * median
     deviation = (steps - median)[~long] / median
     rms = float(np.sqrt(np.mean(np.square(deviation))))
     if rms > MIN_JITTER_STEPS:
@@ -170,19 +172,22 @@ def _jitter_finding(log: Log, steps: FloatArray, rms: float, largest: float, lon
 
 def _is_uniformly_sampled(log: Log, steps: FloatArray, deviation: float, long: BoolArray) -> bool:
     """Whether joint positions are smoother by sample number than by time stamp, where steps change by `deviation`."""
-    before, after = steps[:-1], steps[1:]
+    before = steps[:-1]
+    after = steps[1:]
     numbers = 1 + np.flatnonzero((np.abs(before - after) > deviation) & ~long[:-1] & ~long[1:])
     if len(numbers) < _MIN_COMPARED_SAMPLES:
         return False
     ahead, behind = (log.joint_position[numbers + k] - log.joint_position[numbers] for k in (1, -1))
-    left, right = steps[numbers - 1, None], steps[numbers, None]
+    left = steps[numbers - 1, None]
+    right = steps[numbers, None]
     by_number = np.abs(ahead + behind)
     by_stamp = np.abs(2.0 * (ahead * left + behind * right) / (left + right))
     return bool(by_number.sum() < _MAX_STAMP_RESIDUAL_SHARE * by_stamp.sum())
 
 
 def _gap_finding(steps: FloatArray, median: float, long: BoolArray) -> Finding:
-    numbers, longest = np.flatnonzero(long), int(np.argmax(steps))
+    numbers = np.flatnonzero(long)
+    longest = int(np.argmax(steps))
     lost = int(np.round(steps[numbers] / median - 1.0).sum())
     missing = f"{format_count(len(numbers), 'gap')}, {format_count(lost, 'sample')} missing"
     text = f"{missing}; longest {steps[longest]:.4g} s after sample {longest}"
@@ -207,7 +212,8 @@ MAX_LOG10_PROBABILITY = -8.0
 _MIN_STEP_QUANTA = 4.0
 #: Speed next to a run over that on the same side of it; a robot that stops smoothly is slower. Noisy channels are
 #: averaged over this number of steps.
-_MIN_SPEED_SHARE, _AVERAGED_STEPS = 0.5, 4
+_MIN_SPEED_SHARE = 0.5
+_AVERAGED_STEPS = 4
 #: Median steps beside a run of zeros within which they begin and end at a dead band: 4 standard deviations of noise.
 _MAX_STEPS_TO_DEAD_BAND = 6.0
 #: Share of repeats above which a channel may be held at a lower rate...
@@ -215,12 +221,16 @@ MIN_REPEATED_SHARE = 0.2
 #: ... and the share of runs that have the typical length within one sample, if the rate is regular.
 _MIN_REGULAR_SHARE = 0.8
 #: Share of time in rests, values held longer than this multiple of the mean, of a robot that rests and starts again.
-_MAX_REST_SHARE, _MIN_REST_HOLDS = 0.2, 5.0
+_MAX_REST_SHARE = 0.2
+_MIN_REST_HOLDS = 5.0
 #: Differences below this share of a channel's largest value are rounding, in double and in single precision.
 FLOAT64_ROUNDING_SHARE = 16.0 * float(np.finfo(np.float64).eps)
 _FLOAT32_ROUNDING_SHARE = 2.0 * float(np.finfo(np.float32).eps)
 #: A channel lies on a grid if this share of its small steps is a whole number of quanta; random steps reach a fifth.
-_MIN_GRID_SHARE, _MIN_GRID_STEPS, _MAX_GRID_QUANTA, _GRID_TOLERANCE_QUANTA = 0.95, 10, 10.5, 0.1
+_MIN_GRID_SHARE = 0.95
+_MIN_GRID_STEPS = 10
+_MAX_GRID_QUANTA = 10.5
+_GRID_TOLERANCE_QUANTA = 0.1
 #: Quantiles of the step size at which a quantum is looked for.
 _SMALL_STEP_QUANTILES = (0.001, 0.005, 0.02)
 #: Runs of repeats in one channel above which none is checked: coarse channels repeat all the time.
@@ -308,7 +318,8 @@ def _channel_findings(group: ChannelGroup, all_repeated: BoolArray, columns: np.
     holds = {column: _mean_hold(group.values[:, [column]], all_repeated[:, column]) for column in columns}
     for column in (column for column in columns if not holds[column]):
         repeated = all_repeated[:, column]
-        name, values = group.names[column], group.values[:, column]
+        name = group.names[column]
+        values = group.values[:, column]
         runs = _implausible_runs(values[:, None], repeated)
         small = _in_dead_band(values[:, None], runs)
         if group.field in DEAD_BAND_FIELDS and small.any():
@@ -322,7 +333,8 @@ def _channel_findings(group: ChannelGroup, all_repeated: BoolArray, columns: np.
         if len(runs):
             frozen.append((name, runs))
     if frozen:
-        channels, count = join_names([name for name, _ in frozen]), sum(len(runs) for _, runs in frozen)
+        channels = join_names([name for name, _ in frozen])
+        count = sum(len(runs) for _, runs in frozen)
         yield _frozen_finding(group, channels, frozen, count)
     if dead:
         texts = [
@@ -396,9 +408,11 @@ def _constant_findings(group: ChannelGroup, constant: BoolArray, moves: bool) ->
         names = tuple(name for name, here in zip(group.names, still, strict=True) if here)
         if not names or (value == "0" and group.field in WRENCHES):  # moments of a point contact
             continue
-        severity, advice = NOTE, "none if the robot does not move there: constant channels add no information"
+        severity = NOTE
+        advice = "none if the robot does not move there: constant channels add no information"
         if value == "0" and group.field == "joint_torque":
-            severity, advice = SUSPICIOUS, "write NaN if they were not measured: zeros are fitted as measured torques"
+            severity = SUSPICIOUS
+            advice = "write NaN if they were not measured: zeros are fitted as measured torques"
         elif value != "0" and is_force and moves:
             severity = SUSPICIOUS
             advice = "write NaN if they were not measured: a sensor's readings change while joints move"
@@ -482,7 +496,8 @@ def _in_dead_band(values: FloatArray, runs: Runs) -> BoolArray:
 
     A signal enters a dead band and leaves it within a step of its edge; a lost sensor reads 0 from any reading on.
     """
-    size, steps = np.abs(values), np.abs(np.diff(values, axis=0))
+    size = np.abs(values)
+    steps = np.abs(np.diff(values, axis=0))
     least = np.where(size > 0.0, size, np.inf).min(axis=0)
     inside = (size[runs.first] == 0.0).all(axis=1)
     for neighbour, jump, direction in ((runs.first - 1, runs.first - 1, -1), (runs.last + 2, runs.last + 1, 1)):
@@ -515,7 +530,8 @@ def check_still_base(log: Log) -> Iterator[Finding]:
 
     A base that is held neither turns nor moves, and one that turns about its origin for good is none.
     """
-    position, quat = log.base_position_world, log.base_quat_xyzw
+    position = log.base_position_world
+    quat = log.base_quat_xyzw
     if position is None or quat is None or np.ptp(position, axis=0).any():
         return
     if (turned := _turned_deg(quat)) < MIN_TURN_DEG:
@@ -532,7 +548,8 @@ def check_excitation(log: Log) -> Iterator[Finding]:
 
     It is no fault: such logs tell offsets, or complete others.
     """
-    position, quat = log.base_position_world, log.base_quat_xyzw
+    position = log.base_position_world
+    quat = log.base_quat_xyzw
     moved = float(np.nanmax(np.ptp(log.joint_position, axis=0), initial=0.0))
     if moved > MIN_MOTION or (position is not None and np.ptp(position, axis=0).max() > MIN_MOTION):
         return
@@ -543,7 +560,9 @@ def check_excitation(log: Log) -> Iterator[Finding]:
     yield Finding("no motion", NOTE, "joint_position", text, advice)
 
 
-_REST_LAG_S, _FEWEST_OF_REST = 0.1, 100  # [s]; samples
+# [s]; samples
+_REST_LAG_S = 0.1
+_FEWEST_OF_REST = 100
 
 
 def check_rest(log: Log) -> Iterator[Finding]:

@@ -50,10 +50,12 @@ MAX_SHORT_SIDE_SHARE = 0.1
 #: Time around a change of contact in which forces and velocities may jump: duration of impacts.
 _IMPACT_S = 0.1
 #: Percentiles of a force before and after a step; if the sensor was reset, all move by this share of the step.
-_LEVEL_PERCENTILES, _MIN_LEVEL_SHIFT_SHARE = (10.0, 50.0, 90.0), 0.5
+_LEVEL_PERCENTILES = (10.0, 50.0, 90.0)
+_MIN_LEVEL_SHIFT_SHARE = 0.5
 #: Samples around a reversal of a joint in which its torque may jump; the joint is slower there than this share of its
 #: median speed.
-_REVERSAL_SAMPLES, _MAX_REVERSAL_SPEED_SHARE = 5, 0.2
+_REVERSAL_SAMPLES = 5
+_MAX_REVERSAL_SPEED_SHARE = 0.2
 #: Distance of a step from a whole number of turns that counts as a wrapped angle.
 _WRAP_TOLERANCE_TURNS = 0.01
 
@@ -108,9 +110,9 @@ def warn_of_steps(log: Log) -> None:
     Warns:
         TorchidWarning: an encoder has another zero on either side, or an angle is wrapped.
     """
-    for one in check_jumps(log, channel_groups(log, ("joint_position",))):
-        if one.severity == REJECTED and one.name != "spike":
-            warn(f"{log_title(log.source)}: joint_position, {one.name}: {one.found}; {one.advice}")
+    for jump in check_jumps(log, channel_groups(log, ("joint_position",))):
+        if jump.severity == REJECTED and jump.name != "spike":
+            warn(f"{log_title(log.source)}: joint_position, {jump.name}: {jump.found}; {jump.advice}")
 
 
 def _channel_jumps(group: ChannelGroup, column: int) -> list[Jump]:
@@ -232,9 +234,11 @@ def _finding(
     channels = tuple(dict.fromkeys(channel for channel, _ in jumps))
     channel, clearest = max(jumps, key=lambda pair: pair[1].spreads)
     samples = f"from {clearest.first} to {clearest.last}" if clearest.lasting else f"at {_span('', clearest)}"
-    size, unit = abs(clearest.size), channel_unit(field, channel)
+    size = abs(clearest.size)
+    unit = channel_unit(field, channel)
     if field == "base_quat_xyzw":
-        size, unit = np.degrees(2.0 * size), "deg"
+        size = np.degrees(2.0 * size)
+        unit = "deg"
     text = f"{channel} by {size:.3g} {unit} {samples}, {clearest.spreads:.3g} times the noise around it"
     if len(jumps) > 1:
         count = len({(jump.first, jump.last) for _, jump in jumps})
@@ -257,7 +261,8 @@ SPREAD_BLOCK_STEPS = 128
 #: Longest excursion that counts as a spike.
 MAX_SPIKE_SAMPLES = 5
 #: Sum of both jumps of an excursion over the larger one: of a spike, and of a longer one, in which the robot moves.
-_MAX_SPIKE_RESIDUAL_SHARE, _MAX_LATE_RESIDUAL_SHARE = 0.3, 0.5
+_MAX_SPIKE_RESIDUAL_SHARE = 0.3
+_MAX_LATE_RESIDUAL_SHARE = 0.5
 #: Threshold of the second jump of an excursion over `MIN_JUMP_SPREADS`.
 _RETURN_THRESHOLD_SHARE = 0.5
 #: Differences below this share of the channel's range are rounding.
@@ -280,11 +285,14 @@ def find_jumps(
     kept = np.flatnonzero(np.append(True, np.diff(values) != 0.0))  # repeated values count as one sample
     if len(kept) < NEIGHBOUR_STEPS:
         return []
-    values, steps, joined = values[kept], np.diff(elapsed[kept]), np.diff(piece[kept]) == 0
+    values = values[kept]
+    steps = np.diff(elapsed[kept])
+    joined = np.diff(piece[kept]) == 0
     d = np.where(joined, np.diff(values), 0.0)
     second = np.diff(d)
     spread = _block_spread(second, SPREAD_BLOCK_STEPS)
-    touched, large = np.zeros(len(d), bool), np.abs(second) > MIN_JUMP_SPREADS / 2.0 * spread
+    touched = np.zeros(len(d), bool)
+    large = np.abs(second) > MIN_JUMP_SPREADS / 2.0 * spread
     touched[:-1] |= large
     touched[1:] |= large
     candidates = np.flatnonzero(touched & joined)
@@ -310,8 +318,8 @@ def _block_spread(differences: FloatArray, block: int) -> FloatArray:
     whole = len(differences) // block
     blocks = np.abs(differences[: whole * block]).reshape(whole, block)
     medians = STD_PER_MAD * np.partition(blocks, block // 2, axis=1)[:, block // 2]
-    rest = len(differences) - whole * block
-    return np.append(np.repeat(medians, block), np.full(rest, medians[-1]))
+    remainder = len(differences) - whole * block
+    return np.append(np.repeat(medians, block), np.full(remainder, medians[-1]))
 
 
 def _quantum(d: FloatArray, values: FloatArray) -> float:
@@ -323,7 +331,8 @@ def _quantum(d: FloatArray, values: FloatArray) -> float:
 
 def _excess(d: FloatArray, steps: FloatArray, at: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
     """Distance of steps from the range extrapolated from their neighbours, and the neighbours' spread, (S,) each."""
-    bounds, spreads = [], []
+    bounds = []
+    spreads = []
     away = np.arange(1.0, NEIGHBOUR_STEPS + 1.0)
     pairs = np.triu_indices(NEIGHBOUR_STEPS, 1)
     for direction in (-1, 1):
@@ -340,21 +349,27 @@ def _pair_steps(jumps: list[Jump], longest: int, max_residual: float) -> Iterato
     """The jumps, steps that cancel within `longest` samples to a share `max_residual` joined to one excursion."""
     start = 0
     while start < len(jumps):
-        jump, end, least = jumps[start], start, max_residual
-        net, largest = jump.size, abs(jump.size)
+        jump = jumps[start]
+        end = start
+        least = max_residual
+        net = jump.size
+        largest = abs(jump.size)
         for number in range(start + 1, len(jumps)) if jump.lasting else ():
             second = jumps[number]
             if second.last - jump.last > longest:
                 break
             if second.lasting:
-                net, largest = net + second.size, max(largest, abs(second.size))
+                net = net + second.size
+                largest = max(largest, abs(second.size))
                 if abs(net) < least * largest:
-                    end, least = number, abs(net) / largest if longest <= MAX_SPIKE_SAMPLES else 0.0
+                    end = number
+                    least = abs(net) / largest if longest <= MAX_SPIKE_SAMPLES else 0.0
         if end == start:
             yield jump
         else:
             steps = [step for step in jumps[start : end + 1] if step.lasting]
-            size, spreads = max(abs(step.size) for step in steps), max(abs(step.spreads) for step in steps)
+            size = max(abs(step.size) for step in steps)
+            spreads = max(abs(step.spreads) for step in steps)
             yield Jump(jump.last, jumps[end].first, size, spreads, lasting=False)
             yield from (spike for spike in jumps[start : end + 1] if not spike.lasting)
         start = end + 1

@@ -36,22 +36,30 @@ MAX_SLIP_SHARE = 0.3
 MAX_UNEXPLAINED_SLIP_SHARE = 0.6
 #: Motion of standing feet from which on one of them is named, if the others leave less than this share of it: a zero of
 #: 0.3 rad in one joint of a hexapod's 18 makes 0.07 to 0.1, of a humanoid's knee 0.07; without its foot 0.01 are left.
-MIN_SINGLE_SHARE, MAX_OTHERS_SHARE = 0.05, 0.25
+MIN_SINGLE_SHARE = 0.05
+MAX_OTHERS_SHARE = 0.25
 #: Windows in which the radius is fitted that feet roll on, and the fewest; passes of the fit, whose weights follow.
-_ROLLING_WINDOW_S, _FEWEST_WINDOWS, _PASSES = 0.5, 10, 20
+_ROLLING_WINDOW_S = 0.5
+_FEWEST_WINDOWS = 10
+_PASSES = 20
 #: Difference of a radius that is a finding, as a share and in standard errors: 22 and 31 mm that creep show 16 and 25.
-_RADIUS_SHARE, _RADIUS_ERRORS = 0.4, 5.0
+_RADIUS_SHARE = 0.4
+_RADIUS_ERRORS = 5.0
 #: Unknowns of a base's pose that are of one kind, how large they usually are [m, rad, s], and their weight in the fit.
 _POSE_UNKNOWNS = {"offset": slice(0, 3), "lag": slice(6, 7), "turn": slice(3, 6), "all": slice(0, 7)}
-_POSE_SIZE, _POSE_PRIOR_SHARE = np.array([0.3, 0.3, 0.3, 0.5, 0.5, 0.5, 0.1]), 1e-3
+_POSE_SIZE = np.array([0.3, 0.3, 0.3, 0.5, 0.5, 0.5, 0.1])
+_POSE_PRIOR_SHARE = 1e-3
 #: Share of this motion that a corrected mistake may leave.
 MAX_SLIP_RESIDUAL_SHARE = 1.0 / 3.0
 #: Time at either end of a stance for heel and toe, and the shortest rest of a stance.
-_STANCE_END_S, _MIN_STANCE_S = 0.05, 0.15
+_STANCE_END_S = 0.05
+_MIN_STANCE_S = 0.15
 #: Samples that are compared, and the rms motion that the base must have [rad, or 0.3 m].
-_MAX_COMPARED_SAMPLES, _MIN_BASE_MOTION = 1500, 0.01
+_MAX_COMPARED_SAMPLES = 1500
+_MIN_BASE_MOTION = 0.01
 #: The same for each of many pairs of joints, and their step: the shortest stance must have four.
-_MAX_TRIAL_SAMPLES, _TRIAL_STEP_S = 600, _MIN_STANCE_S / 4.0
+_MAX_TRIAL_SAMPLES = 600
+_TRIAL_STEP_S = _MIN_STANCE_S / 4.0
 _LENGTH_UNIT_M = 0.3
 _CORRECTED_FIELDS = (
     *("joint_names", "joint_position", "base_quat_xyzw", "base_position_world"),
@@ -80,11 +88,11 @@ def check_standing_feet(
     if slip < MAX_SLIP_SHARE and single is None:
         yield from other_pose
         return
-    found = _usual_mistake(log, robot, contacts, slip, poses, derived) if slip >= MAX_SLIP_SHARE else None
-    if found is None and not radius and not derived:
-        found = _exchanged_joints(log, robot, contacts, slip)
-    if (found := found or single or next(other_pose, None)) is not None:
-        yield found
+    finding = _usual_mistake(log, robot, contacts, slip, poses, derived) if slip >= MAX_SLIP_SHARE else None
+    if finding is None and not radius and not derived:
+        finding = _exchanged_joints(log, robot, contacts, slip)
+    if (finding := finding or single or next(other_pose, None)) is not None:
+        yield finding
     elif slip > MAX_UNEXPLAINED_SLIP_SHARE:
         yield _unexplained_motion(log, robot, contacts, slip, poses)
 
@@ -98,7 +106,8 @@ def _usual_mistake(
     derived: tuple[str, ...],
 ) -> Finding | None:
     """A finding about the usual mistake without which standing feet keep still best."""
-    best, least = None, MAX_SLIP_RESIDUAL_SHARE * slip
+    best = None
+    least = MAX_SLIP_RESIDUAL_SHARE * slip
     for mistake in (*possible_mistakes(log, robot), *reversed_joints(log)):
         if mistake.field not in _CORRECTED_FIELDS or mistake.field.startswith(derived):
             continue
@@ -106,7 +115,8 @@ def _usual_mistake(
         is_posed = same_poses(log, corrected, robot, [contact.frame for contact in contacts])
         trial = measure_foot_slip(corrected, robot, contacts, poses if is_posed else None)
         if trial is not None and trial < least:
-            best, least = mistake, trial
+            best = mistake
+            least = trial
     return None if best is None else _corrected(best, slip, least)
 
 
@@ -120,12 +130,12 @@ def _corrected(mistake: Mistake, slip: float, least: float) -> Finding:
 def _exchanged_joints(log: Log, robot: Robot, contacts: Sequence[Contact], slip: float) -> Finding | None:
     """A finding about any two joints whose names are exchanged, one of them at least between a foot and the base."""
     every = max(1, int(_TRIAL_STEP_S / median_step(log)))
-    some = log.select(slice(0, every * _MAX_TRIAL_SAMPLES, every))
+    thinned = log.select(slice(0, every * _MAX_TRIAL_SAMPLES, every))
     legs = {name for contact in contacts for name in joints_of_limb(robot, contact.frame)}
     pairs = list(exchanged_joints(log.joint_names, legs))
-    trials = [(measure_foot_slip(mistake.correct(some), robot, contacts), mistake) for mistake in pairs]
-    left = [(share, mistake) for share, mistake in trials if share is not None]
-    least, best = min(left, key=lambda pair: pair[0], default=(slip, None))
+    trials = [(measure_foot_slip(mistake.correct(thinned), robot, contacts), mistake) for mistake in pairs]
+    judged = [(share, mistake) for share, mistake in trials if share is not None]
+    least, best = min(judged, key=lambda pair: pair[0], default=(slip, None))
     return None if best is None or least > MAX_OTHERS_SHARE * slip else _corrected(best, slip, least)
 
 
@@ -134,7 +144,7 @@ def _unexplained_motion(
 ) -> Finding:
     """A finding about feet that move though they stand, which no usual mistake explains, with those that move most."""
     alone = {c.frame: measure_foot_slip(log, robot, [c], poses) for c in contacts}
-    moving = sorted((name for name, own in alone.items() if own), key=lambda name: -(alone[name] or 0.0))
+    moving = sorted((name for name, share in alone.items() if share), key=lambda name: -(alone[name] or 0.0))
     most = join_names([f"{name} {format_percent(alone[name] or 0.0)} %" for name in moving])
     text = f"standing feet move {100 * slip:.3g} % as much as the base above them{UNEXPLAINED}"
     advice = "check signs, scales and zeros of joint positions, the base's orientation and position, the flags, and"
@@ -149,12 +159,12 @@ def _single_foot(
     if slip < MIN_SINGLE_SHARE:
         return None
     without = {c.frame: measure_foot_slip(log, robot, [x for x in contacts if x is not c], poses) for c in contacts}
-    left = {frame: rest for frame, rest in without.items() if rest is not None}
-    frame = min(left, key=lambda name: left[name], default="")
-    if not frame or left[frame] > MAX_OTHERS_SHARE * slip:
+    remaining = {frame: share for frame, share in without.items() if share is not None}
+    frame = min(remaining, key=lambda name: remaining[name], default="")
+    if not frame or remaining[frame] > MAX_OTHERS_SHARE * slip:
         return None
     text = f"{frame} moves though it stands: standing feet move {format_percent(slip)} % as much as the base above"
-    text += f" them, {format_percent(left[frame])} % without it"
+    text += f" them, {format_percent(remaining[frame])} % without it"
     advice = "check zeros, scales and signs of the joint positions in its limb, its flags, and whether it slips"
     if still := join_names(still_in_limb(log, robot, frame)):
         text += f"; {still} of its limb stands still throughout: a dead encoder?"
@@ -167,7 +177,8 @@ def _pose_findings(log: Log, contacts: Sequence[Contact], slip: float, poses: Li
 
     Markers of motion capture are seldom at the base link's origin, and their axes seldom its own.
     """
-    quat, place = log.base_quat_xyzw, log.base_position_world
+    quat = log.base_quat_xyzw
+    place = log.base_position_world
     if slip < MIN_SINGLE_SHARE or quat is None or place is None or log.contact_active is None:
         return
     feet = [c for c in contacts if c.frame in log.contact_names and c.frame in poses]
@@ -184,11 +195,12 @@ def _pose_findings(log: Log, contacts: Sequence[Contact], slip: float, poses: Li
         R = (recorded(at) * Rotation.from_rotvec(x[3:6]).inv()).as_matrix()
         origin = np.stack([np.interp(at, log.time, axis) for axis in place.T], axis=1) - R @ x[:3]
         world = [np.einsum("nij,nj->ni", R[s], foot) + origin[s] - rolled for foot, rolled, s in stances]
-        return np.concatenate([one - one.mean(axis=0) for one in world]).ravel()
+        return np.concatenate([positions - positions.mean(axis=0) for positions in world]).ravel()
 
     as_recorded = float(np.linalg.norm(motion(np.zeros(7)))) if stances else 0.0
     for unknowns in _POSE_UNKNOWNS.values() if as_recorded else ():
-        x, size = np.zeros(7), _POSE_SIZE[unknowns]
+        x = np.zeros(7)
+        size = _POSE_SIZE[unknowns]
 
         def cost(y: FloatArray, which: slice = unknowns, size: FloatArray = size) -> FloatArray:
             correction = np.zeros(7)
@@ -196,18 +208,18 @@ def _pose_findings(log: Log, contacts: Sequence[Contact], slip: float, poses: Li
             return np.append(motion(correction), _POSE_PRIOR_SHARE * as_recorded * y)
 
         x[unknowns] = size * least_squares(cost, np.zeros(len(size)), ftol=1e-3, xtol=1e-3).x
-        if (left := float(np.linalg.norm(motion(x)))) < MAX_SLIP_RESIDUAL_SHARE * as_recorded:
-            yield _pose_finding(x, slip, left / as_recorded)
+        if (residual := float(np.linalg.norm(motion(x)))) < MAX_SLIP_RESIDUAL_SHARE * as_recorded:
+            yield _pose_finding(x, slip, residual / as_recorded)
             return
 
 
-def _pose_finding(x: FloatArray, slip: float, left: float) -> Finding:
+def _pose_finding(x: FloatArray, slip: float, residual: float) -> Finding:
     """A finding about a frame at x[:3] [m], turned by x[3:6] [rad], in the base, whose pose is x[6] [s] late."""
     at, turn = (", ".join(f"{value:.0f}" for value in values) for values in (1e3 * x[:3], np.degrees(x[3:6])))
     parts = [f"of a point at ({at}) mm of the base link"] if x[:3].any() else []
     parts += [f"turned about it by ({turn}) degrees"] if x[3:6].any() else []
     parts += [f"{1e3 * abs(x[6]):.0f} ms {'late' if x[6] > 0.0 else 'early'}"] if x[6] else []
-    text = f"standing feet move {format_percent(slip)} % as much as the base above them, {format_percent(left)} %"
+    text = f"standing feet move {format_percent(slip)} % as much as the base above them, {format_percent(residual)} %"
     text += f" of that if the base's pose is {join_names(parts)}"
     advice = "give the pose of the base link itself; shift_s delays files of a log"
     return Finding("frame", SUSPICIOUS, "base_quat_xyzw", text, advice)
@@ -220,11 +232,12 @@ def _radius_findings(log: Log, robot: Robot, contacts: Sequence[Contact], poses:
     if len(windows) < _FEWEST_WINDOWS:
         return
     squares, products, unit = np.array(windows).T
-    weight, radius = np.ones(len(windows)), 0.0
+    weight = np.ones(len(windows))
+    radius = 0.0
     for _ in range(_PASSES):
         radius = float(weight @ products / max(weight @ unit, np.finfo(float).tiny))
-        left = np.maximum(squares - 2.0 * radius * products + radius**2 * unit, 0.0)
-        weight = 1.0 / np.maximum(left, max(float(np.median(left)), np.finfo(float).tiny))
+        residual = np.maximum(squares - 2.0 * radius * products + radius**2 * unit, 0.0)
+        weight = 1.0 / np.maximum(residual, max(float(np.median(residual)), np.finfo(float).tiny))
     error = np.linalg.norm(weight * (products - radius * unit)) / max(weight @ unit, np.finfo(float).tiny)
     stated = float(np.mean([c.radius for c in points]))
     if radius > 0.0 and abs(radius - stated) > max(_RADIUS_SHARE * max(radius, stated), _RADIUS_ERRORS * error):
@@ -242,7 +255,8 @@ def _rolling_windows(log: Log, points: Sequence[Contact], poses: LinkPoses) -> I
     Mean square of the first [m^2], mean product [m], mean square of the second: the vectors move by the radius times
     the second where feet roll, see `measure_foot_slip`.
     """
-    quat, active = np.asarray(log.base_quat_xyzw), np.asarray(log.contact_active)
+    quat = np.asarray(log.base_quat_xyzw)
+    active = np.asarray(log.contact_active)
     frames = [poses[c.frame].numpy() for c in points]
     places = [rotate_to_world(quat, c.pose(T)[:, :3, 3]) for c, T in zip(points, frames, strict=True)]
     rolls = [_rolled(log, replace(c, radius=1.0), T) for c, T in zip(points, frames, strict=True)]
@@ -251,8 +265,8 @@ def _rolling_windows(log: Log, points: Sequence[Contact], poses: LinkPoses) -> I
     for i, j in combinations(range(len(points)), 2):
         for stance in _stances(log, flags[i] & flags[j]):
             for start in range(stance.start, stance.stop - length // 2, length):
-                own = slice(start, min(start + length, stance.stop))
-                moved, rolled = ((x[i] - x[j])[own] - (x[i] - x[j])[own].mean(axis=0) for x in (places, rolls))
+                window = slice(start, min(start + length, stance.stop))
+                moved, rolled = ((x[i] - x[j])[window] - (x[i] - x[j])[window].mean(axis=0) for x in (places, rolls))
                 yield float((moved**2).mean()), float((moved * rolled).mean()), float((rolled**2).mean())
 
 
@@ -305,7 +319,8 @@ def _rolled(log: Log, contact: Contact, T_base_foot: FloatArray) -> FloatArray:
 def _stances(log: Log, active: np.ndarray) -> Iterator[slice]:
     """Samples of each long enough stance, without its ends."""
     step = median_step(log)
-    ends, shortest = round(_STANCE_END_S / step), max(4, round(_MIN_STANCE_S / step))
+    ends = round(_STANCE_END_S / step)
+    shortest = max(4, round(_MIN_STANCE_S / step))
     for span in find_spans(active):
         if span.last + 1 - span.first - 2 * ends >= shortest:
             yield slice(span.first + ends, span.last + 1 - ends)
@@ -318,7 +333,8 @@ def _stance_motion(
     quat = log.base_quat_xyzw
     if quat is None:
         return []
-    world, sums = rotate_to_world(quat, vector) + (0.0 if origin is None else origin), []
+    world = rotate_to_world(quat, vector) + (0.0 if origin is None else origin)
+    sums = []
     for stance in _stances(log, active):
         in_world, in_base = (
             float(np.square((x - x.mean(axis=0)) / unit).sum()) for x in (world[stance], vector[stance])

@@ -40,13 +40,15 @@ from torchid.robot.urdf import position_limits
 
 #: Unexplained forces without the unknowns over those with them, and what these may leave: more, and the forces are
 #: another robot's.
-MIN_UNEXPLAINED_RATIO, MAX_LEFT = 1.25, 1.5
+MIN_UNEXPLAINED_RATIO = 1.25
+MAX_LEFT = 1.5
 #: Kinds that leave as much as the best one, up to this ratio: the one with the fewest unknowns is named.
 _ALIKE_RATIO = 1.1
 #: Unexplained forces below which kinds leave as much: half a percent of the forces.
 _MIN_LEFT = 0.1
 #: Gain of a torque or a contact's sensor that is reported; of all torques where nothing says what the robot weighs.
-MIN_GAIN_RATIO, MIN_COMMON_GAIN_RATIO = 1.15, 1.3
+MIN_GAIN_RATIO = 1.15
+MIN_COMMON_GAIN_RATIO = 1.3
 #: Size of the torques that the URDF needs over that of the readings, from which on they are compared with the former.
 _MIN_SHORTFALL = 3.0
 #: Factor of a torque up to which its readings are corrected before it is told from 0.
@@ -58,7 +60,10 @@ _FACTOR_TOLERANCE_RATIO = 3.0
 #: Offset of a torque over the rms of all torques: those of good sensors are 0.08 of it.
 MIN_OFFSET_SHARE = 0.1
 #: Zero of a hinge [rad] or slide [m], tilt of gravity and turn of a sensor [rad], shift of the point of wrenches [m].
-MIN_ZERO, MIN_TILT, MIN_TURN, MIN_SHIFT_M = 0.05, 0.1, 0.17, 0.03
+MIN_ZERO = 0.05
+MIN_TILT = 0.1
+MIN_TURN = 0.17
+MIN_SHIFT_M = 0.03
 #: Lag that is reported: filters of sensors are late by 10 ms.
 MIN_LAG_S = 0.025
 #: Change of a lag over the log that is reported.
@@ -77,8 +82,11 @@ _SHARE_TOLERANCE = 0.3
 MIN_UNEXPLAINED = 0.5
 #: Fields that change no motion.
 READINGS = ("joint_torque", *WRENCHES)
-_SMALL, _STEPS, _LEAST_STEP = 1e-4, 8, 2e-3
-_OF_BASE, _OF_JOINTS = ("base_", "imu_"), ("joint_position", "joint_velocity", "joint_acceleration")
+_SMALL = 1e-4
+_STEPS = 8
+_LEAST_STEP = 2e-3
+_OF_BASE = ("base_", "imu_")
+_OF_JOINTS = ("joint_position", "joint_velocity", "joint_acceleration")
 
 Findings = Callable[[Sequence[int], Estimate], list[Finding]]
 Moved = Callable[[FloatArray], tuple[ForceEquations, FloatArray] | None]
@@ -310,8 +318,8 @@ def _torque_kinds(log: Log, equations: ForceEquations) -> Iterator[Kind]:
     weighed = bool(equations.builder.sensors.wrench[:, :3].all()) and len(equations.model.contacts) > 0
     ratio = MIN_GAIN_RATIO if weighed and not robot.fixed_base else MIN_COMMON_GAIN_RATIO
 
-    def all_alike(_: Sequence[int], found: Estimate) -> list[Finding]:
-        return [_common_gain(1.0 + float(found.value[0]), float(found.spread[0]), robot)]
+    def all_alike(_: Sequence[int], estimate: Estimate) -> list[Finding]:
+        return [_common_gain(1.0 + float(estimate.value[0]), float(estimate.spread[0]), robot)]
 
     common = gains.sum(axis=2, keepdims=True)
     is_large = _is_reverse if any(scaled) else lambda x: _beyond(x, ratio)
@@ -323,8 +331,8 @@ def _torque_kinds(log: Log, equations: ForceEquations) -> Iterator[Kind]:
     yield Kind(common, max(2.0, shortfall), is_large, all_alike, bounded=True, equations=weighted)
     if len(known) > 1:
 
-        def single(which: Sequence[int], found: Estimate) -> list[Finding]:
-            return _single_gains([names[k] for k in which], 1.0 + found.value, found.spread, robot)
+        def single(which: Sequence[int], estimate: Estimate) -> list[Finding]:
+            return _single_gains([names[k] for k in which], 1.0 + estimate.value, estimate.spread, robot)
 
         def rescaled(x: FloatArray) -> tuple[ForceEquations, FloatArray] | None:
             """Readings that are far too large count for little: others, of the right size, count for more."""
@@ -356,9 +364,9 @@ def _torque_kinds(log: Log, equations: ForceEquations) -> Iterator[Kind]:
     least = MIN_OFFSET_SHARE * rms
     advice = "check the zero of the sensor, or set sensors.offsets: {joint_torque: log}"
 
-    def offsets(which: Sequence[int], found: Estimate) -> list[Finding]:
+    def offsets(which: Sequence[int], estimate: Estimate) -> list[Finding]:
         out = []
-        for k, x, std in zip(which, found.value, found.spread, strict=True):
+        for k, x, std in zip(which, estimate.value, estimate.spread, strict=True):
             text = (
                 f"{names[k]}: torques read {abs(x):.3g} +- {std:.2g} {units[k]} too {'much' if x > 0.0 else 'little'}"
             )
@@ -458,7 +466,10 @@ def _contact_kinds(log: Log, equations: ForceEquations) -> Iterator[Kind]:
     if "contact_force" not in equations.model.declared.terms.scales:
         everything = columns[..., ::4].sum(axis=2, keepdims=True)
         yield Kind(
-            everything, _MAX_UNIT_RATIO, lambda x: _beyond(x, 2.0), lambda _, found: _common_wrench(found, robot, field)
+            everything,
+            _MAX_UNIT_RATIO,
+            lambda x: _beyond(x, 2.0),
+            lambda _, estimate: _common_wrench(estimate, robot, field),
         )
         frames = [contact.frame for contact in equations.model.contacts]
         least = np.array([MIN_GAIN_RATIO - 1.0, *3 * [np.sin(MIN_TURN)]])
@@ -466,7 +477,7 @@ def _contact_kinds(log: Log, equations: ForceEquations) -> Iterator[Kind]:
             columns,
             0.5,
             lambda x: np.abs(x) > np.resize(least, len(x)),
-            lambda which, found: _single_wrenches([frames[k // 4] for k in which[::4]], found, robot, field),
+            lambda which, estimate: _single_wrenches([frames[k // 4] for k in which[::4]], estimate, robot, field),
             together=4,
         )
     if equations.builder.sensors.wrench.all():
@@ -474,7 +485,7 @@ def _contact_kinds(log: Log, equations: ForceEquations) -> Iterator[Kind]:
             shifts,
             0.3,
             lambda x: np.abs(x) > MIN_SHIFT_M,
-            lambda _, found: [_point(found.value, log, robot)],
+            lambda _, estimate: [_point(estimate.value, log, robot)],
             together=3,
         )
 
@@ -510,9 +521,9 @@ def _contact_columns(equations: ForceEquations) -> tuple[FloatArray, FloatArray]
     return torch.stack(columns, dim=2).numpy(), shifts.numpy()
 
 
-def _common_wrench(found: Estimate, robot: Robot, field: str) -> list[Finding]:
-    gain = 1.0 + float(found.value[0])
-    text = f"all wrenches: the factor that fits the {robot.format} best is {gain:.3g} +- {found.spread[0]:.2g}"
+def _common_wrench(estimate: Estimate, robot: Robot, field: str) -> list[Finding]:
+    gain = 1.0 + float(estimate.value[0])
+    text = f"all wrenches: the factor that fits the {robot.format} best is {gain:.3g} +- {estimate.spread[0]:.2g}"
     if _is_reverse(np.array(gain - 1.0)):
         advice = "reverse it: wrenches are what the ground exerts on the robot"
         return [Finding("unit, sign or frame", REJECTED, field, f"all reversed: {text}", advice)]
@@ -522,9 +533,9 @@ def _common_wrench(found: Estimate, robot: Robot, field: str) -> list[Finding]:
     return [Finding("unit, sign or frame", REJECTED, field, named, advice)] if units else []
 
 
-def _single_wrenches(frames: Sequence[str], found: Estimate, robot: Robot, field: str) -> list[Finding]:
+def _single_wrenches(frames: Sequence[str], estimate: Estimate, robot: Robot, field: str) -> list[Finding]:
     out = []
-    for name, (x, *turn), std in zip(frames, found.value.reshape(-1, 4), found.spread[::4], strict=True):
+    for name, (x, *turn), std in zip(frames, estimate.value.reshape(-1, 4), estimate.spread[::4], strict=True):
         size = float(np.linalg.norm(turn))
         gain = 1.0 + float(x)
         angle = float(np.arctan2(size, gain))
@@ -573,8 +584,9 @@ def _gravity_kind(equations: ForceEquations) -> Kind:
     zero = torch.zeros_like(samples.joint_velocity)
     still = replace(samples, joint_velocity=zero, joint_acceleration=zero)
 
-    def findings(_: Sequence[int], found: Estimate) -> list[Finding]:
-        text = f"torques lack {100.0 * found.value[0]:.0f} +- {100.0 * found.spread[0]:.0f} % of gravity: a controller"
+    def findings(_: Sequence[int], estimate: Estimate) -> list[Finding]:
+        percent = f"{100.0 * estimate.value[0]:.0f} +- {100.0 * estimate.spread[0]:.0f} %"
+        text = f"torques lack {percent} of gravity: a controller"
         advice = "record torques before gravity is subtracted, not those of external forces, nor commands beside"
         advice += " gravity's; or add what was subtracted"
         return [Finding("gravity", REJECTED, "joint_torque", f"{text} has compensated it?", advice)]
@@ -602,10 +614,10 @@ def _stop_kind(log: Log, equations: ForceEquations) -> Kind | None:
                 columns.append(column)
                 pushed.append((name, limit))
 
-    def findings(which: Sequence[int], found: Estimate) -> list[Finding]:
+    def findings(which: Sequence[int], estimate: Estimate) -> list[Finding]:
         advice = "leave these samples out: a stop's force is in no model; or record motion within the limits"
         out = []
-        for number, x, std in zip(which, found.value, found.spread, strict=True):
+        for number, x, std in zip(which, estimate.value, estimate.spread, strict=True):
             name, limit = pushed[number]
             force, length = ("N", "m") if name in robot.sliding else ("N m", "rad")
             text = f"{name} pushes against its limit of {limit:.3g} {length} with {x:.2g} +- {std:.1g} {force}"
@@ -639,10 +651,10 @@ def _zero_kind(equations: ForceEquations) -> Kind:
         other = ForceEquations.of(at, equations.model)
         return None if other is None else (other, _zero_columns(other))
 
-    def findings(which: Sequence[int], found: Estimate) -> list[Finding]:
+    def findings(which: Sequence[int], estimate: Estimate) -> list[Finding]:
         advice = "check the zero of its encoder, and whether the robot's file counts from the same posture"
         out = []
-        for joint, x, std in zip(which, found.value, found.spread, strict=True):
+        for joint, x, std in zip(which, estimate.value, estimate.spread, strict=True):
             name = robot.joint_names[joint]
             unit = "m" if name in robot.sliding else "rad"
             text = f"{name}: positions read {abs(x):.2g} +- {std:.1g} {unit} too {'much' if x < 0.0 else 'little'}"
@@ -661,8 +673,8 @@ def tilt_kind(equations: ForceEquations) -> Kind:
     fixed = model.robot.fixed_base
     robot = model.robot
 
-    def findings(_: Sequence[int], found: Estimate) -> list[Finding]:
-        x, y = np.degrees(found.value)
+    def findings(_: Sequence[int], estimate: Estimate) -> list[Finding]:
+        x, y = np.degrees(estimate.value)
         axes = "the base's own" if fixed else "the world's"
         text = f"gravity is {np.hypot(x, y):.2g} degrees from down ({x:.2g} and {y:.2g} about {axes} x and y axes)"
         advice = "check the mounting of the base" if fixed else "check that the world's z axis points up"
@@ -765,9 +777,9 @@ def _lag_kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[
             at = equations_of(pieces, model)
             return None if at is None else (at, columns(pieces, at, clock, len(x)))
 
-        def late(_: Sequence[int], found: Estimate, clock: _Clock = clock) -> list[Finding]:
-            seconds = float(found.value[0])
-            spread = 1e3 * float(found.spread[0])
+        def late(_: Sequence[int], estimate: Estimate, clock: _Clock = clock) -> list[Finding]:
+            seconds = float(estimate.value[0])
+            spread = 1e3 * float(estimate.spread[0])
             text = f"{clock.what} {1e3 * abs(seconds):.3g} +- {spread:.2g} ms {'later' if seconds > 0.0 else 'earlier'}"
             advice = "check their stamps and filters; shift_s delays files of a log"
             if clock.field == "joint_torque":
@@ -775,12 +787,12 @@ def _lag_kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[
                 advice = f"check their stamps and filters, or set actuators.delay: {delay:.2g}"
             return [Finding("delay", SUSPICIOUS, clock.field, f"{text} than {clock.than}", advice, clock.channels)]
 
-        def fast(_: Sequence[int], found: Estimate, clock: _Clock = clock) -> list[Finding]:
-            start = 1e3 * (found.value[0] - 0.5 * found.value[1])
-            end = 1e3 * (found.value[0] + 0.5 * found.value[1])
-            rate = 100.0 * float(found.value[1]) / duration
+        def fast(_: Sequence[int], estimate: Estimate, clock: _Clock = clock) -> list[Finding]:
+            start = 1e3 * (estimate.value[0] - 0.5 * estimate.value[1])
+            end = 1e3 * (estimate.value[0] + 0.5 * estimate.value[1])
+            rate = 100.0 * float(estimate.value[1]) / duration
             text = f"{clock.what} {start:.3g} ms later than {clock.than} at the start and {end:.3g} ms at the end"
-            text += f" (+- {1e3 * found.spread[1]:.2g} ms): a clock that is {abs(rate):.2g} %"
+            text += f" (+- {1e3 * estimate.spread[1]:.2g} ms): a clock that is {abs(rate):.2g} %"
             advice = "stamp all sensors by one clock, or multiply the time of these by what makes up for it"
             text += " fast" if rate > 0.0 else " slow"
             return [Finding("clock", SUSPICIOUS, clock.field, text, advice, clock.channels)]

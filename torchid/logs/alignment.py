@@ -106,10 +106,10 @@ class Series:
         run = segments[number]
         if number + 1 < len(segments) and self.stamps[run.stop - 1] < time[-1]:
             before, after = self.stamps[[run.stop - 1, run.stop]]
-            found = f"a gap of {after - before:.4g} s from {before:.4g} s on, "
-            found += f"where the median step is {np.median(np.diff(self.stamps)):.4g} s"
+            reason = f"a gap of {after - before:.4g} s from {before:.4g} s on, "
+            reason += f"where the median step is {np.median(np.diff(self.stamps)):.4g} s"
             accepted = f"steps of at most {LONGEST_STEP:g} median steps: cut the {self.whole} there"
-            raise LogError.at_field(self.name or "time", found, accepted)
+            raise LogError.at_field(self.name or "time", reason, accepted)
         return run
 
     def _interpolated(self, time: FloatArray, run: slice, name: str) -> FloatArray:
@@ -234,9 +234,9 @@ def _side_by_side(
     """
     own_names = [name for _, of_file, _ in pieces for name in of_file]
     if len(pieces) > 1 and (len(set(own_names)) < len(own_names) or not all(of_file for _, of_file, _ in pieces)):
-        found = f"both in {pieces[0][0]} and in {pieces[1][0]}"
+        reason = f"both in {pieces[0][0]} and in {pieces[1][0]}"
         accepted = "every field but time in one of several files, or other joints or contacts in each"
-        raise LogError.at_field(field, found, accepted)
+        raise LogError.at_field(field, reason, accepted)
     values = np.concatenate([x for *_, x in pieces], axis=1) if len(pieces) > 1 else pieces[0][2]
     own_names = own_names or names
     if own_names == names or values.ndim < 2:
@@ -267,13 +267,13 @@ def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Seq
         LogError: an entry of which no file has a column.
     """
     maps = [columns_of_file(as_in_file(columns, file, files), texts) for file, texts in zip(files, given, strict=True)]
-    found = [_entries_in(of_file, texts) for of_file, texts in zip(maps, given, strict=True)]
+    entries = [_entries_in(of_file, texts) for of_file, texts in zip(maps, given, strict=True)]
     for name in columns.fields:
-        if not any(name in of_file for of_file in found):
+        if not any(name in of_file for of_file in entries):
             none = f"no column of it in {join_names(files, MOST_LISTED)}"
             raise LogError.at_field(f"{KEY}.{name}", none, "columns that one of the files has")
     out = []
-    for of_file, has in zip(maps, found, strict=True):
+    for of_file, has in zip(maps, entries, strict=True):
         without: dict[str, Any] = dict.fromkeys({*columns.fields, "imu_frame"} - has)
         without |= {} if WRENCHES[1] in has else {"plates": {}}
         out.append(replace(of_file, **without))
@@ -356,10 +356,10 @@ def _common_stamps(labels: Sequence[str], stamps: Sequence[FloatArray]) -> Float
     early = min(range(len(labels)), key=lambda number: stamps[number][-1])
     common = time[(time >= stamps[late][0] - slack) & (time <= stamps[early][-1] + slack)]
     if not len(common):
-        found = f"no stamp of {labels[0]} that all files cover: "
-        found += f"{labels[late]} starts at {stamps[late][0]:.6f} s, "
-        found += f"{labels[early]} ends at {stamps[early][-1]:.6f} s"
-        raise LogError.at_field("time", found, "stamps of one clock, or shift_s, what is added to those of a file")
+        reason = f"no stamp of {labels[0]} that all files cover: "
+        reason += f"{labels[late]} starts at {stamps[late][0]:.6f} s, "
+        reason += f"{labels[early]} ends at {stamps[early][-1]:.6f} s"
+        raise LogError.at_field("time", reason, "stamps of one clock, or shift_s, what is added to those of a file")
     return common
 
 

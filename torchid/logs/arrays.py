@@ -30,8 +30,8 @@ def parse_names(name: str, array: NDArray[Any]) -> tuple[str, ...]:
             accepted = f"printable names of at most {MAX_LETTERS} characters"
             raise LogError.at_field(name, f"'{excerpt(item)}' at {i}", accepted)
         if not item or item in seen:
-            found = f"'{item}' again at {i}" if item else f"an empty name at {i}"
-            raise LogError.at_field(name, found, "names that are all different")
+            reason = f"'{item}' again at {i}" if item else f"an empty name at {i}"
+            raise LogError.at_field(name, reason, "names that are all different")
         seen.add(item)
     return names
 

@@ -52,15 +52,15 @@ class _Mcap:
     def channels(self) -> list[tuple[str, str, str]]:
         """As of `_Bag`."""
         types = dict[int, str]()
-        found = dict[int, Any]()
+        channels = dict[int, Any]()
         for record, _ in self._scan():
             if type(record).__name__ == "Schema":
                 package, _, message = record.name.partition("/")  # ROS 1 omits `msg`
                 is_short = message and "/" not in message
                 types[record.id] = f"{package}/msg/{message}" if is_short else record.name
             elif type(record).__name__ == "Channel":
-                found[record.id] = record
-        return [(x.topic, types.get(x.schema_id, "unknown"), x.message_encoding) for x in found.values()]
+                channels[record.id] = record
+        return [(x.topic, types.get(x.schema_id, "unknown"), x.message_encoding) for x in channels.values()]
 
     def records(self, topics: list[str]) -> Iterator[tuple[str, int, bytes, float]]:
         """As of `_Bag`."""

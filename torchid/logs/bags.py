@@ -84,7 +84,9 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 _PACKAGES = ("rosbags", "mcap", "lz4", "zstandard")
 _FLAG_ROLE = "contact_active"
 _FEET = "foot_force"
-_REPORT_EVERY, _LISTED = 1000, 30  # messages between reports of progress, topics in a message
+# messages between reports of progress, topics in a message
+_REPORT_EVERY = 1000
+_LISTED = 30
 
 
 # --------------------------------------------------------------------------------------------------------------- files
@@ -108,8 +110,8 @@ class BagChannel:
 def _open_file(path: Path) -> Iterator[RemoteObject]:
     """Open a file of a bag; LogError where it is damaged, also in later reads, or its reader is not installed."""
     if absent := [name for name in _PACKAGES if find_spec(name) is None]:
-        found = f"a bag, but {' and '.join(absent)} {'are' if len(absent) > 1 else 'is'} not installed"
-        raise LogError(path, "file", found, how_to_install("ros"))
+        reason = f"a bag, but {' and '.join(absent)} {'are' if len(absent) > 1 else 'is'} not installed"
+        raise LogError(path, "file", reason, how_to_install("ros"))
     accepted = f"a complete {path.suffix.lower()} file of ROS messages"
     with reader_errors_explained("file", accepted), open_apart(serve_bag, path) as opened:
         yield opened
@@ -127,8 +129,8 @@ def list_channels(files: list[Path]) -> dict[str, BagChannel]:
             for channel in [BagChannel(*names) for names in opened.call("channels")]:
                 first = channels.setdefault(channel.topic, channel)
                 if first != channel:
-                    found = f"both {first.type} and {channel.type}"
-                    raise LogError.at_field(channel.topic, found, "one type of message per topic")
+                    reason = f"both {first.type} and {channel.type}"
+                    raise LogError.at_field(channel.topic, reason, "one type of message per topic")
     return channels
 
 
@@ -250,8 +252,8 @@ class _Messages:
         if self.frame is None or not self.frame:
             self.frame = require_plain_name(frame)
         if frame != self.frame:
-            found = f"{name} '{self.frame}', then '{require_plain_name(frame)}'"
-            raise LogError.at_field(self.topic, found, f"one {name}")
+            reason = f"{name} '{self.frame}', then '{require_plain_name(frame)}'"
+            raise LogError.at_field(self.topic, reason, f"one {name}")
 
     def parts(self, layout: tuple[tuple[str, ...], tuple[int, ...]]) -> _Parts:
         """The messages of one layout."""
@@ -267,8 +269,8 @@ class _Messages:
             raise LogError.at_field(self.topic, "no messages", "at least one")
         layout, *others = self.rows
         if others:
-            found = f"arrays of {' and '.join(str(sum(lengths)) for _, lengths in self.rows)} numbers"
-            raise LogError.at_field(self.topic, found, "as many in every message")
+            reason = f"arrays of {' and '.join(str(sum(lengths)) for _, lengths in self.rows)} numbers"
+            raise LogError.at_field(self.topic, reason, "as many in every message")
         return self.parts(layout)
 
 
@@ -328,9 +330,9 @@ def _series(topic: AnyTopic, messages: _Messages) -> _TopicSeries:
         rows = np.concatenate([x[again] for x in fields.values()], axis=1).view(np.int64)
         differ = np.any(rows != np.concatenate([x[again - 1] for x in fields.values()], axis=1).view(np.int64), axis=1)
         if differ.any():
-            found = f"messages of different content with one stamp, {stamps[again[np.argmax(differ)]] / 1e9:.9f} s"
+            reason = f"messages of different content with one stamp, {stamps[again[np.argmax(differ)]] / 1e9:.9f} s"
             by_tick = f", or {_LOW_STATE}.stamps: receipt" * isinstance(topic, LowStateTopic)
-            raise LogError.at_field(str(topic.topic), found, "every stamp once" + by_tick)
+            raise LogError.at_field(str(topic.topic), reason, "every stamp once" + by_tick)
         warn_about_file(f"{topic.topic}: {len(again)} messages come twice; each counts once")
         stamps = np.delete(stamps, again)
         fields = {name: np.delete(x, again, axis=0) for name, x in fields.items()}
@@ -355,11 +357,11 @@ def _joint_parts(topic: JointTopic, messages: _Messages) -> tuple[tuple[str, ...
         common = list(kept[0].numbers) if kept else [_JOINT_FIELDS[path] for path in of_layout]
         if [_JOINT_FIELDS[path] for path in of_layout] != common or "position" not in of_layout:
             in_all = " and ".join(path for path, name in _JOINT_FIELDS.items() if name in common)
-            found = f"a message with {' and '.join(of_layout) or 'nothing'}"
-            raise LogError.at_field(messages.topic, found, f"positions, and in every message {in_all or 'the same'}")
+            reason = f"a message with {' and '.join(of_layout) or 'nothing'}"
+            raise LogError.at_field(messages.topic, reason, f"positions, and in every message {in_all or 'the same'}")
         if any(length != len(names) for length in lengths if length):
-            found = f"{len(rows.values)} values in {len(rows.stamps)} messages of {len(names)} names"
-            raise LogError.at_field(messages.topic, found, f"one {' and one '.join(of_layout)} per name")
+            reason = f"{len(rows.values)} values in {len(rows.stamps)} messages of {len(names)} names"
+            raise LogError.at_field(messages.topic, reason, f"one {' and one '.join(of_layout)} per name")
         parts = messages.parts(layout)
         order = [names.index(name) for name in wanted]
         fields = {_JOINT_FIELDS[path]: parts.numbers[path][:, order] for path in of_layout}
@@ -382,13 +384,13 @@ def _joint_parts(topic: JointTopic, messages: _Messages) -> tuple[tuple[str, ...
 def _check_joints(topic: JointTopic, names: Sequence[str], wanted: Sequence[str]) -> None:
     """Refuse a message in which joints repeat, or that does not have all that are wanted."""
     if len(set(names)) != len(names):
-        found = f"names {', '.join(names[:4])}, ... that repeat"
-        raise LogError.at_field(topic.topic, found, "joints of different names")
+        reason = f"names {', '.join(names[:4])}, ... that repeat"
+        raise LogError.at_field(topic.topic, reason, "joints of different names")
     missing = [name for name in wanted if name not in names]
     if missing or (not topic.joints and len(names) != len(wanted)):
-        found = f"a message without {missing[0]}" if missing else f"a message with {len(names)} joints"
+        reason = f"a message without {missing[0]}" if missing else f"a message with {len(names)} joints"
         accepted = f"all {len(wanted)} joints in every message, or joint_states.joints with those that are"
-        raise LogError.at_field(topic.topic, found, accepted)
+        raise LogError.at_field(topic.topic, reason, accepted)
 
 
 def _fields(topic: AnyTopic, messages: _Messages, parts: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -409,8 +411,8 @@ def _fields(topic: AnyTopic, messages: _Messages, parts: Mapping[str, FloatArray
         return {"active": rows}
     column = ("fx", "fy", "fz").index(topic.component or "fz") if messages.type in WRENCHES else topic.index or 0
     if column >= rows.shape[1]:
-        found = f"an array of {rows.shape[1]} numbers, without index {column}"
-        raise LogError.at_field(messages.topic, found, "an index below that, from 0 on")
+        reason = f"an array of {rows.shape[1]} numbers, without index {column}"
+        raise LogError.at_field(messages.topic, reason, "an index below that, from 0 on")
     return {"force": topic.sign * rows[:, column : column + 1]}
 
 
@@ -425,8 +427,8 @@ def _imu_fields(topic: ImuTopic, parts: Mapping[str, FloatArray]) -> dict[str, F
     if topic.orientation:
         quat = out["base_quat_xyzw"]
         if len(quat) > 1 and not np.any(quat != quat[0]):
-            found = f"one orientation throughout, {np.round(quat[0], 3).tolist()}, as of a driver without any"
-            raise LogError.at_field(topic.topic, found, f"orientations, or {_IMU}.orientation: false")
+            reason = f"one orientation throughout, {np.round(quat[0], 3).tolist()}, as of a driver without any"
+            raise LogError.at_field(topic.topic, reason, f"orientations, or {_IMU}.orientation: false")
         out["base_quat_xyzw"] = require_unit(topic.topic, quat, _IMU)
     return out
 
@@ -450,11 +452,11 @@ def _check_low_state(topic: LowStateTopic, field: str, kind: str) -> None:
     robot = JOINT_ORDERS.get(topic.robot or "")
     if robot is not None and robot.message != kind:
         others = ", ".join(x for x, order in JOINT_ORDERS.items() if order.message == kind)
-        found = f"'{topic.robot}', which sends {robot.message}, though {topic.topic} carries {kind}"
-        raise LogError.at_field(f"{field}.robot", found, others)
+        reason = f"'{topic.robot}', which sends {robot.message}, though {topic.topic} carries {kind}"
+        raise LogError.at_field(f"{field}.robot", reason, others)
     if len(topic.order) > MOTORS[kind]:
-        found = f"{len(topic.order)} names, though {kind} has {MOTORS[kind]} motors"
-        raise LogError.at_field(f"{field}.joints", found, "at most that many, by number of the motor")
+        reason = f"{len(topic.order)} names, though {kind} has {MOTORS[kind]} motors"
+        raise LogError.at_field(f"{field}.joints", reason, "at most that many, by number of the motor")
     if topic.reads_feet and kind != GO:
         key = "forces" if topic.forces else "above"
         raise LogError.at_field(f"{field}.{key}", f"set, though {kind} has no foot sensors", f"no {key}")
@@ -470,8 +472,8 @@ def _low_state_fields(topic: LowStateTopic, parts: Mapping[str, FloatArray]) -> 
         LogError: ankles and waist by motor rather than by joint, or quaternions of no length.
     """
     if (modes := parts["mode_pr"]).any():
-        found = f"mode_pr {modes[modes != 0.0][0]:g}: ankles and waist by their parallel motors (A, B), not by joint"
-        raise LogError.at_field(topic.topic, found, "messages with mode_pr 0: pitch and roll")
+        reason = f"mode_pr {modes[modes != 0.0][0]:g}: ankles and waist by their parallel motors (A, B), not by joint"
+        raise LogError.at_field(topic.topic, reason, "messages with mode_pr 0: pitch and roll")
     numbers = [number for number, name in enumerate(topic.order) if name is not None]
     names = {"q": "joint_position", "dq": "joint_velocity", "tau_est": "joint_torque"}
     out = {name: parts[f"motor_state.{part}"][:, numbers] for part, name in names.items()}
@@ -508,12 +510,12 @@ def _low_state_stamps(topic: LowStateTopic, ticks: Stamps, received: Stamps) -> 
     usual = int(np.clip(np.median(late), -(1 << 62), 1 << 62))  # also for receipts that no clock would give
     off = np.abs(late - usual)
     if topic.stamps is None and off.max() > _MAX_TICK_ERROR_NS + _MAX_TICK_ERROR_SHARE * np.ptp(received):
-        found = (
+        reason = (
             f"ticks that advance by {np.ptp(elapsed) / 1e9:.4g} s while messages come for "
             f"{np.ptp(received) / 1e9:.4g} s, and are off by up to {off.max() / 1e9:.3g} s"
         )
         accepted = f"ticks of 1 ms, or {_LOW_STATE}.stamps: receipt, or tick where these are right"
-        raise LogError.at_field(topic.topic, found, accepted)
+        raise LogError.at_field(topic.topic, reason, accepted)
     return np.asarray(received[:1] + usual + elapsed, dtype=np.int64), True
 
 
@@ -535,9 +537,11 @@ class _Recording:
         rate = series[topics.clock]
         stamps = rate.stamps[(rate.stamps >= late.stamps[0]) & (rate.stamps <= early.stamps[-1])]
         if not len(stamps):
-            found = f"no stamp of {rate.topic} that all topics cover: {late.topic} starts at {late.stamps[0] / 1e9:.3f}"
-            found += f" s, {early.topic} ends at {early.stamps[-1] / 1e9:.3f} s"
-            raise LogError.at_field("time", found, "one common clock")
+            reason = (
+                f"no stamp of {rate.topic} that all topics cover: {late.topic} starts at {late.stamps[0] / 1e9:.3f}"
+            )
+            reason += f" s, {early.topic} ends at {early.stamps[-1] / 1e9:.3f} s"
+            raise LogError.at_field("time", reason, "one common clock")
         self._origin = stamps[0]
         self.time: FloatArray = (stamps - self._origin) / 1e9
 
@@ -643,9 +647,9 @@ class _Recording:
         with np.errstate(over="ignore"):  # infinite is above any threshold
             force = np.linalg.norm(fields["wrench"][:, :3], axis=1) if "wrench" in fields else fields["force"][:, 0]
         if np.isnan(force).any():
-            found = f"a force of NaN in message {np.argmax(np.isnan(force))}"
+            reason = f"a force of NaN in message {np.argmax(np.isnan(force))}"
             accepted = "forces to compare with contact_force_threshold, or contact_active"
-            raise LogError.at_field(self.series[role].topic, found, accepted)
+            raise LogError.at_field(self.series[role].topic, reason, accepted)
         return self.held(role, force) > topics.contact_force_threshold
 
     def limb_sensors(self) -> dict[str, NDArray[Any]]:
@@ -664,10 +668,10 @@ class _Recording:
         The base link and the child links of fixed joints are defined by the URDF, which is not read here: without an
         expected frame, the warning names the assumed frame, `otherwise`.
         """
-        found = self.frame(role)
-        if found and (expected is None or found.removeprefix("/") != expected.removeprefix("/")):
+        reason = self.frame(role)
+        if reason and (expected is None or reason.removeprefix("/") != expected.removeprefix("/")):
             taken_for = otherwise if expected is None else f"'{expected}'"
-            text = f"frame '{found}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
+            text = f"frame '{reason}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
             warn_about_file(f"{self.series[role].topic}: {text}")
 
 
@@ -699,8 +703,8 @@ def read_bag(
     channels = list_channels(files)
     if topics is None:
         listed = [f"{name} ({channel.type})" for name, channel in channels.items()]
-        found = f"missing; the bag has {join_names(listed, _LISTED) or 'no topics'}"
-        raise LogError.at_field("logs.topics", found, "what its topics hold, of which torchid init writes a first map")
+        reason = f"missing; the bag has {join_names(listed, _LISTED) or 'no topics'}"
+        raise LogError.at_field("logs.topics", reason, "what its topics hold, of which torchid init writes a first map")
     roles = {role: topic for role, topic in topics.by_role.items() if topic.topic is not None}
     for role, topic in roles.items():
         _check_type(f"logs.topics.{role}", topic, channels)
@@ -727,13 +731,13 @@ def _check_type(field: str, topic: AnyTopic, channels: Mapping[str, BagChannel])
     if not isinstance(topic, ForceTopic):
         return
     if kind in NUMBER_ARRAYS and topic.index is None:
-        found = f"missing, though {name} carries {kind}"
-        raise LogError.at_field(f"{field}.index", found, "which of its numbers is this contact's, from 0 on")
+        reason = f"missing, though {name} carries {kind}"
+        raise LogError.at_field(f"{field}.index", reason, "which of its numbers is this contact's, from 0 on")
     options = (("index", topic.index, NUMBER_ARRAYS), ("component", topic.component, WRENCHES))
     for option, value, kinds in options:
         if value is not None and kind not in kinds:
-            found = f"{value!r}, though {name} carries {kind}"
-            raise LogError.at_field(f"{field}.{option}", found, f"no {option} of such a message")
+            reason = f"{value!r}, though {name} carries {kind}"
+            raise LogError.at_field(f"{field}.{option}", reason, f"no {option} of such a message")
 
 
 def _read(

@@ -81,11 +81,11 @@ def unknown_columns(columns: Sequence[str], has_map: bool) -> LogError:
     is_misspelt = field not in COLUMN_FIELDS and difflib.get_close_matches(field, COLUMN_FIELDS, cutoff=0.6)
     if len(columns) == 1 and is_misspelt:
         return UnknownFieldError.at_field(f"column '{columns[0]}'", field, COLUMN_FIELDS)
-    found = f"{len(columns)} unknown: {join_names(columns, MOST_LISTED)}"
+    reason = f"{len(columns)} unknown: {join_names(columns, MOST_LISTED)}"
     if all(map(_UNNAMED.fullmatch, columns)):
-        found = f"{len(columns)} of numbers without a line of names"
+        reason = f"{len(columns)} of numbers without a line of names"
     accepted = "names of the log format, or logs.columns of an experiment file, which says what they hold"
-    return LogError.at_field("columns", found, f"{accepted}; torchid init writes one")
+    return LogError.at_field("columns", reason, f"{accepted}; torchid init writes one")
 
 
 # --------------------------------------------------------------------------------------------------- entries of a map
@@ -371,10 +371,10 @@ def values_by_name(key: str, given: Mapping[str, _X], labels: Sequence[str]) -> 
     out: dict[str, tuple[int, _X]] = {}
     for pattern, value in given.items():
         letters = letters_of(pattern)
-        found = [label for label in labels if fits(label, pattern)]
-        if not found and letters:
+        matching = [label for label in labels if fits(label, pattern)]
+        if not matching and letters:
             raise UnknownNameError.at_field(key, excerpt(pattern), labels)
-        for label in found:
+        for label in matching:
             most = out.get(label, (-1, value))
             if most[0] == letters and most[1] != value:
                 raise ConfigError.at_field(key, f"two values of {label}", "patterns of which one has more letters")
@@ -384,11 +384,11 @@ def values_by_name(key: str, given: Mapping[str, _X], labels: Sequence[str]) -> 
 
 def values_of_all(key: str, what: str, given: Mapping[str, _X], kind: str, labels: Sequence[str]) -> list[_X]:
     """Values of all names, of values by pattern; errors as `values_by_name`, and ConfigError for a name without one."""
-    found = values_by_name(key, given, labels)
-    without = [label for label in labels if label not in found]
+    values = values_by_name(key, given, labels)
+    without = [label for label in labels if label not in values]
     if without:
         raise ConfigError.at_field(key, f"no {what} of {without[0]}", f"one for every {kind}; * stands for all others")
-    return [found[label] for label in labels]
+    return [values[label] for label in labels]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -531,8 +531,8 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
     if not given and getattr(entry, "above", None) is not None:
         given = ["above"]
     if len(given) != 1:
-        found = f"{' and '.join(given)} together" if given else "nothing that says where it is"
-        raise ConfigError.at_field(key, found, f"one of {', '.join(name for name in _WAYS if hasattr(entry, name))}")
+        reason = f"{' and '.join(given)} together" if given else "nothing that says where it is"
+        raise ConfigError.at_field(key, reason, f"one of {', '.join(name for name in _WAYS if hasattr(entry, name))}")
     (way,) = given
     unsaid = (
         "scale",
@@ -543,8 +543,8 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
     )
     beside = [name for name in unsaid if getattr(entry, name, None)] if way not in ("column", "columns") else []
     if beside:
-        found = f"{beside[0]} beside {way}, which it says nothing about"
-        raise ConfigError.at_field(key, found, f"{way} without {beside[0]}")
+        reason = f"{beside[0]} beside {way}, which it says nothing about"
+        raise ConfigError.at_field(key, reason, f"{way} without {beside[0]}")
     if getattr(entry, "moment", None) is not None and way != "force":
         raise ConfigError.at_field(key, "moment without force", "force, with or without moment")
     if isinstance(entry, TorqueEntry) and entry.pd is not None:
@@ -556,11 +556,11 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
 def _check_law(law: PdLaw) -> None:
     key = f"{KEY}.joint_torque.pd"
     if (law.kp is None) != (law.position is None):
-        found = "position without kp" if law.kp is None else "kp without position"
-        raise ConfigError.at_field(key, found, "kp together with position, the desired one")
+        reason = "position without kp" if law.kp is None else "kp without position"
+        raise ConfigError.at_field(key, reason, "kp together with position, the desired one")
     if law.kd is None and (law.velocity is not None or law.kp is None):
-        found = "no gain" if law.velocity is None else "velocity without kd"
-        raise ConfigError.at_field(key, found, "kp with position, or kd with or without velocity, or both")
+        reason = "no gain" if law.velocity is None else "velocity without kd"
+        raise ConfigError.at_field(key, reason, "kp with position, or kd with or without velocity, or both")
     for name in ("kp", "kd"):
         gains = getattr(law, name)
         if gains is not None and bool(gains.value) + bool(gains.column) + bool(gains.columns) != 1:
@@ -581,9 +581,9 @@ def _check_part(part: EntryPart) -> None:
             raise ConfigError.at_field(key, f"{FILL_IN}, which is to be filled in", accepted)
         _check_pattern(key, part, text)
     if entry.columns and not part.kind and set(entry.columns) != set(part.components):
-        found = f"components {', '.join(entry.columns)}"
+        reason = f"components {', '.join(entry.columns)}"
         accepted = f"each of {', '.join(part.components)}" if part.components else "column, as it is one number"
-        raise ConfigError.at_field(f"{key}.columns", found, accepted)
+        raise ConfigError.at_field(f"{key}.columns", reason, accepted)
     quantities = tuple(dict.fromkeys(quantity for given in part.quantities.values() for quantity in given))
     for unit in entry.unit.values():
         unit_factor(f"{key}.unit", unit, quantities)
@@ -591,11 +591,11 @@ def _check_part(part: EntryPart) -> None:
 
 def _check_pattern(key: str, part: EntryPart, text: str) -> None:
     allowed = [*([part.kind] if part.kind else []), "index", *(AXES if part.components else ())]
-    found = [name for name, _ in PLACEHOLDER.findall(text)]
-    wrong = [name for name in found if name not in allowed or found.count(name) > 1]
-    if wrong or len({part.kind, "index"} & set(found)) > 1 or len(set(found) & set(AXES)) > 1:
+    names = [name for name, _ in PLACEHOLDER.findall(text)]
+    wrong = [name for name in names if name not in allowed or names.count(name) > 1]
+    if wrong or len({part.kind, "index"} & set(names)) > 1 or len(set(names) & set(AXES)) > 1:
         accepted = f"at most one each of {', '.join(f'{{{x}}}' for x in allowed)}, and one of them for the names"
-        raise ConfigError.at_field(key, f"{{{(wrong or found)[0]}}} in '{excerpt(text)}'", accepted)
+        raise ConfigError.at_field(key, f"{{{(wrong or names)[0]}}} in '{excerpt(text)}'", accepted)
 
 
 def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> None:
@@ -621,8 +621,8 @@ def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> Non
         given = [name for name in names if name is not None]
         unknown = [name for name in given if kind in known and name not in known[kind]]
         if len(unknown) > 1 and unknown == given:
-            found = f"none of {join_names(given)} is a {kind} of the robot; is it the one that was recorded?"
-            raise ConfigError.at_field(f"{KEY}.{key}", found, f"names of the robot: {join_names(list(known[kind]))}")
+            reason = f"none of {join_names(given)} is a {kind} of the robot; is it the one that was recorded?"
+            raise ConfigError.at_field(f"{KEY}.{key}", reason, f"names of the robot: {join_names(list(known[kind]))}")
         if unknown:
             raise UnknownNameError.at_field(f"{KEY}.{key}", unknown[0], known[kind])
 

@@ -73,9 +73,9 @@ def existing_log_kind(path: Path, beside: Path | None = None) -> LogKind:
         raise LogError(path, "file", "a folder", f"a log ({', '.join(READABLE)}), or a folder recorded by ROS 2")
     kind = _kind(path, READABLE)
     if not os.path.isfile(path):
-        found = "a pipe, a device or a socket" if os.path.exists(path) else "no such file"
+        reason = "a pipe, a device or a socket" if os.path.exists(path) else "no such file"
         where = f"; later files of a log are looked for from the folder of the first, {beside}" if beside else ""
-        raise LogError(path, "file", found, f"an existing log ({', '.join(READABLE)}){where}")
+        raise LogError(path, "file", reason, f"an existing log ({', '.join(READABLE)}){where}")
     return kind
 
 
@@ -167,8 +167,8 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
     """
     suffix = _suffix(path, ARRAYS)
     if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
-        raise LogError(path, "file", found, f"an existing log ({', '.join(ARRAYS)})")
+        reason = "a folder" if path.is_dir() else "no such file"
+        raise LogError(path, "file", reason, f"an existing log ({', '.join(ARRAYS)})")
     kind = {
         ".npz": "a complete .npz (zip) archive",
         ".mat": "a complete file of Matlab 5 or later",

@@ -16,7 +16,8 @@ from torchid.logs.signal_noise import STATED_FIELDS, signal_noise
 from torchid.logs.timeline import LONGEST_MEDIAN_STEP, spline_derivatives
 from torchid.parameters import GRAVITY
 
-_LOWEST_HZ, _STEPS_PER_DECADE = 1.0, 40
+_LOWEST_HZ = 1.0
+_STEPS_PER_DECADE = 40
 _SEGMENT_S = 8.0  # of the spectra: lines 1/8 Hz apart
 _USUAL_HZ = 10.0  # robots and people move below 5 Hz
 _RATE_SHARE = 0.2  # largest cutoff over the sample rate
@@ -24,7 +25,8 @@ _RATE_SHARE = 0.2  # largest cutoff over the sample rate
 #: nothing is taken off.
 _NOISE_SHARE = 5e-4
 #: What a filter must leave, whatever the noise, and where a motion ends, as shares of the power of accelerations.
-_KEPT_SHARE, _MOTION_SHARE = 0.95, 0.99
+_KEPT_SHARE = 0.95
+_MOTION_SHARE = 0.99
 #: Of the power of gravity, what noise of the base's derived linear acceleration may be, whatever motion is lost: masses
 #: come out as much too small, while a filter leaves equations true that are linear in the motion.
 _WEIGHT_SHARE = 0.01
@@ -32,7 +34,9 @@ _WEIGHT_SHARE = 0.01
 _HARMONICS = 6.0
 #: Bins of a spectrum per decade, up to a share of the sample rate that splines leave as it is, and how many times the
 #: noise a bin may have.
-_BINS_PER_DECADE, _TOP_SHARE, _ABOVE_NOISE = 20, 0.25, 3.0
+_BINS_PER_DECADE = 20
+_TOP_SHARE = 0.25
+_ABOVE_NOISE = 3.0
 #: What an acceleration is worked out of, the first that was recorded, with the number of derivatives.
 _SOURCES = (
     (("joint_acceleration", 0), ("joint_velocity", 1), ("joint_position", 2)),

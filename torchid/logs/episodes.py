@@ -55,8 +55,8 @@ class EpisodeArrays:
         """Episodes and samples as the first two axes that the positions have."""
         array = self._load(name)
         if array.ndim < 2:
-            found = f"axis: {entry.axis}, but '{excerpt(name)}' has shape {array.shape}"
-            raise LogError.at_field(f"{KEY}.episodes", found, "arrays (episodes, samples, ...) or the other way round")
+            reason = f"axis: {entry.axis}, but '{excerpt(name)}' has shape {array.shape}"
+            raise LogError.at_field(f"{KEY}.episodes", reason, "arrays (episodes, samples, ...) or the other way round")
         self._axis = entry.axis
         self._shape = (int(array.shape[0]), int(array.shape[1]))
         count = self._shape[entry.axis]

@@ -51,13 +51,13 @@ def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, Bool
         if missing.all() and log.contact_active is not None:
             continue
         if missing.any():
-            found = f"nan at {describe_element((int(np.argmax(missing)), column), log.contact_names)}"
+            reason = f"nan at {describe_element((int(np.argmax(missing)), column), log.contact_names)}"
             accepted = f"forces to compare with {_KEY}, or gaps that preprocessing.bridge_gaps_s bridges"
             if missing.all():
-                found = f"no force of {name}"
+                reason = f"no force of {name}"
                 accepted = f"forces to compare with {_KEY}, or contact_active"
             is_scalar = scalar is not None and (wrench is None or not np.isnan(scalar[:, column]).all())
-            raise LogError(log.source, FORCE_NORMAL if is_scalar else log.contact_wrench_field, found, accepted)
+            raise LogError(log.source, FORCE_NORMAL if is_scalar else log.contact_wrench_field, reason, accepted)
         loaded = hysteresis(force[:, column], settings.above, below)
         active[:, column] = without_short(loaded, shortest)
         certain &= active[:, column] | ~loaded

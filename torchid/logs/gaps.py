@@ -187,9 +187,9 @@ def require_no_turns(log: Log) -> None:
         return
     first = log.time[1 + int(jumps.any(axis=1).argmax())]
     names = join_names([log.joint_names[joint] for joint in joints])
-    found = f"{names} jumps by a whole turn, {format_count(int(jumps.sum()), 'time')}, first at {first:.6g} s"
+    reason = f"{names} jumps by a whole turn, {format_count(int(jumps.sum()), 'time')}, first at {first:.6g} s"
     accepted = "angles without jumps: logs.columns.joint_position.turn_from, or unwrap them"
-    raise LogError(log.source, "joint_position", found, accepted)
+    raise LogError(log.source, "joint_position", reason, accepted)
 
 
 @dataclass(frozen=True)

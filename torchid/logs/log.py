@@ -346,11 +346,11 @@ def check_time(time: FloatArray) -> None:
     not_increasing = time[1:] <= time[:-1]
     if not_increasing.any():
         i = int(np.argmax(not_increasing))
-        found = f"{time[i + 1]} at sample {i + 1}, after {time[i]} at sample {i}"
+        reason = f"{time[i + 1]} at sample {i + 1}, after {time[i]} at sample {i}"
         several = "; of recordings one after the other (episodes) the name with [#0] for the first, or [#0:8]"
         coarse = "; where rows are steps of a clock that stamps round, logs.columns.time: {step: ...}"
         accepted = "strictly increasing seconds" + (several if time[i + 1] < time[i] else coarse)
-        raise LogError.at_field("time", found, accepted)
+        raise LogError.at_field("time", reason, accepted)
 
 
 def parse_time(array: NDArray[Any]) -> FloatArray:
@@ -372,8 +372,8 @@ def normalize_quaternions(name: str, quat: FloatArray, allow_nan: bool = False) 
     bad = ~((np.abs(norm - 1.0) <= NORM_TOLERANCE) | np.isnan(norm))
     if bad.any():
         i = int(np.argmax(bad))
-        found = f"norm {norm[i]:.6g} at sample {i}"
-        raise LogError.at_field(name, found, f"unit quaternions, to {NORM_TOLERANCE:g}")
+        reason = f"norm {norm[i]:.6g} at sample {i}"
+        raise LogError.at_field(name, reason, f"unit quaternions, to {NORM_TOLERANCE:g}")
     norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0  # normalised quaternions stay bit for bit
     return np.asarray(quat / norm[:, None], dtype=np.float64)
 
@@ -389,8 +389,8 @@ def normalize_normals(normals: FloatArray, active: BoolArray, labels: tuple[str,
     bad = active & ~known
     if bad.any():
         sample, contact = (int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
-        found = f"norm {norm[sample, contact]:.6g} at {describe_element((sample, contact), labels)}, while in contact"
-        raise LogError.at_field(NORMALS, found, f"unit vectors, to {NORM_TOLERANCE:g}")
+        reason = f"norm {norm[sample, contact]:.6g} at {describe_element((sample, contact), labels)}, while in contact"
+        raise LogError.at_field(NORMALS, reason, f"unit vectors, to {NORM_TOLERANCE:g}")
     norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0
     return np.where(known[..., None], normals / np.where(known, norm, 1.0)[..., None], np.nan)
 

@@ -129,8 +129,8 @@ def measured_coverage(log: Log, timeline: Timeline) -> dict[str, Coverage]:
     if timeline.low_pass is None and timeline.output is None:
         return {}
     coverage = {name: measure_coverage(log, name) for name in NAN_ALLOWED if getattr(log, name) is not None}
-    for name, found in coverage.items():
-        warn_of_gaps(log, name, found)
+    for name, share in coverage.items():
+        warn_of_gaps(log, name, share)
     return coverage
 
 
@@ -221,8 +221,8 @@ def _orientation(log: Log, derivatives: list[FloatArray], timeline: Timeline) ->
     q, *rates = derivatives
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     if timeline.low_pass is not None and np.min(norm) < _MIN_QUATERNION_NORM:
-        found = f"a cutoff that removes the base's rotation (norm of the filtered quaternion {np.min(norm):.2g})"
-        raise InputError(log.source, "preprocessing.cutoff_hz", found, "a cutoff above the rate of that rotation")
+        reason = f"a cutoff that removes the base's rotation (norm of the filtered quaternion {np.min(norm):.2g})"
+        raise InputError(log.source, "preprocessing.cutoff_hz", reason, "a cutoff above the rate of that rotation")
     out = {"base_quat_xyzw": q / norm}
     if rates:
         out["base_angular_velocity_base"] = angular_velocity_base(q, rates[0])

@@ -42,8 +42,8 @@ def require_unit(topic: str, quat: FloatArray, key: str) -> FloatArray:
         norm = np.linalg.norm(quat, axis=1)
         bad = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
     if bad.any():
-        found = f"a quaternion of the IMU of norm {norm[bad][0]:.4g}"
-        raise LogError.at_field(topic, found, f"unit quaternions, or {key}.orientation: false")
+        reason = f"a quaternion of the IMU of norm {norm[bad][0]:.4g}"
+        raise LogError.at_field(topic, reason, f"unit quaternions, or {key}.orientation: false")
     return quat
 
 

@@ -230,17 +230,17 @@ def check_topics(topics: Topics, needs_flags: bool = True) -> None:
         UnknownNameError: a robot that is not known by name; the rate topic is not one of the topics.
     """
     if (topics.joint_states is None) == (topics.low_state is None):
-        found = "neither joint_states nor low_state" if topics.low_state is None else "joint_states and low_state"
+        reason = "neither joint_states nor low_state" if topics.low_state is None else "joint_states and low_state"
         accepted = "joint_states: the name of a topic, or low_state: a mapping with topic and robot"
-        raise ConfigError.at_field("logs.topics", found, f"one of the two, {accepted}")
+        raise ConfigError.at_field("logs.topics", reason, f"one of the two, {accepted}")
     if topics.low_state is not None:
         _check_low_state(topics, topics.low_state)
     if topics.other_joint_states and topics.joint_states is None:
         raise ConfigError.at_field("logs.topics.other_joint_states", "given without joint_states", "both, or neither")
     given = [name for topic in topics.joint_topics.values() for name in topic.names.values()]
     if again := [name for name in given if given.count(name) > 1]:
-        found = f"two names of '{excerpt(again[0])}'"
-        raise ConfigError.at_field("logs.topics.joint_states.names", found, "each joint of the robot once")
+        reason = f"two names of '{excerpt(again[0])}'"
+        raise ConfigError.at_field("logs.topics.joint_states.names", reason, "each joint of the robot once")
     for name, contact in topics.contact_active.items():
         if (contact.topic is None) != contact.always:
             accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"
@@ -261,49 +261,49 @@ def _check_flags(topics: Topics) -> None:
     unflagged = [name for name in topics.contacts if name not in topics.contact_active and name not in by_count]
     counted = [name for name in unflagged if name in topics.feet]
     if counted:
-        found = f"missing, though nothing else says when {counted[0]} touches"
+        reason = f"missing, though nothing else says when {counted[0]} touches"
         accepted = f"a reading [counts], {_OTHER_FLAGS}"
-        raise ConfigError.at_field("logs.topics.low_state.above", found, accepted)
+        raise ConfigError.at_field("logs.topics.low_state.above", reason, accepted)
     if unflagged and topics.contact_force_threshold is None:
-        found = f"missing, though nothing else says when {unflagged[0]} touches"
+        reason = f"missing, though nothing else says when {unflagged[0]} touches"
         accepted = f"a force [N], {_OTHER_FLAGS}"
-        raise ConfigError.at_field("logs.topics.contact_force_threshold", found, accepted)
+        raise ConfigError.at_field("logs.topics.contact_force_threshold", reason, accepted)
 
 
 def _check_low_state(topics: Topics, low_state: LowStateTopic) -> None:
     """Refuse a low state that does not fit itself or the other topics."""
     key = "logs.topics.low_state"
     if (low_state.robot is None) == (low_state.joints is None):
-        found = "neither robot nor joints" if low_state.robot is None else "robot and joints together"
+        reason = "neither robot nor joints" if low_state.robot is None else "robot and joints together"
         accepted = f"one of the two: robot ({', '.join(JOINT_ORDERS)}), or joints by number of the motor"
-        raise ConfigError.at_field(key, found, accepted)
+        raise ConfigError.at_field(key, reason, accepted)
     if low_state.robot is not None and low_state.robot not in JOINT_ORDERS:
         raise UnknownNameError.at_field(f"{key}.robot", low_state.robot, JOINT_ORDERS)
     for name, given in (("joints", low_state.order), ("feet", low_state.feet or ())):
         names = [name for name in given if name is not None]
         again = [name for name in names if names.count(name) > 1]
         if again or (given and not names):
-            found = f"'{excerpt(again[0])}' twice" if again else "no name"
-            raise ConfigError.at_field(f"{key}.{name}", found, "every name once, null for what is left out")
+            reason = f"'{excerpt(again[0])}' twice" if again else "no name"
+            raise ConfigError.at_field(f"{key}.{name}", reason, "every name once, null for what is left out")
     if low_state.feet is not None and not low_state.reads_feet:
         accepted = "above, the reading from which on a foot touches, or forces: true"
         raise ConfigError.at_field(f"{key}.feet", "given, though nothing reads them", accepted)
     robot = JOINT_ORDERS.get(low_state.robot or "")
     if low_state.reads_feet and robot is not None and robot.message != GO:
         reading = "forces" if low_state.forces else "above"
-        found = f"'{low_state.robot}', which sends {robot.message} without foot sensors, though {reading} is set"
+        reason = f"'{low_state.robot}', which sends {robot.message} without foot sensors, though {reading} is set"
         others = ", ".join(name for name, order in JOINT_ORDERS.items() if order.message == GO)
         accepted = f"a robot that sends {GO} ({others}), if the messages are of one, or no {reading}"
-        raise ConfigError.at_field(f"{key}.robot", found, accepted)
+        raise ConfigError.at_field(f"{key}.robot", reason, accepted)
     if low_state.reads_feet and not low_state.feet_by_number:
-        found = "missing, though the foot sensors are read"
-        raise ConfigError.at_field(f"{key}.feet", found, "contacts by number in foot_force, null for what is left out")
+        reason = "missing, though the foot sensors are read"
+        raise ConfigError.at_field(f"{key}.feet", reason, "contacts by number in foot_force, null for what is left out")
     if topics.imu is not None and low_state.frame is not None:
         raise ConfigError.at_field("logs.topics.imu", f"set beside {key}.frame", "one IMU, that of the base")
     twice = [name for name in topics.contact_force_normal if low_state.forces and name in topics.feet]
     if twice:
-        found = f"set, though {key}.forces is its force too"
-        raise ConfigError.at_field(f"logs.topics.contact_force_normal.{twice[0]}", found, "one of the two")
+        reason = f"set, though {key}.forces is its force too"
+        raise ConfigError.at_field(f"logs.topics.contact_force_normal.{twice[0]}", reason, "one of the two")
 
 
 def require_joints(topics: Topics | None, joints: Collection[str]) -> None:

@@ -173,8 +173,8 @@ class _Search:
             return Matched(part, (), tuple(entry.columns[x] for x in part.components), False, True)
         splits = {_splits(part, text) for text in entry.columns.values()}
         if len(splits) > 1:
-            found = "patterns of components beside other names"
-            raise ConfigError.at_field(f"{part.where}.columns", found, "{axis} in all or in none")
+            reason = "patterns of components beside other names"
+            raise ConfigError.at_field(f"{part.where}.columns", reason, "{axis} in all or in none")
         listed = enumerate(entry.columns.items(), entry.first_index)
         columns = tuple(column for k, (name, text) in listed for column in _spell(part, text, k, name))
         return Matched(part, tuple(entry.columns), columns, True, splits.pop())
@@ -189,8 +189,8 @@ class _Search:
         """What a file calls a joint or contact."""
         before, after = self._around_name(part)
         if not name.startswith(before) or not name.endswith(after) or len(name) <= len(before) + len(after):
-            found = f"'{self._columns.name_of(part.kind)}', which '{excerpt(name)}' is no example of"
-            raise ConfigError.at_field(f"{KEY}.{part.kind}_name", found, f"a pattern of all names of {part.kind}s")
+            reason = f"'{self._columns.name_of(part.kind)}', which '{excerpt(name)}' is no example of"
+            raise ConfigError.at_field(f"{KEY}.{part.kind}_name", reason, f"a pattern of all names of {part.kind}s")
         return name[len(before) : len(name) - len(after)]
 
     def _assign(self) -> dict[str, list[str]]:
@@ -219,8 +219,8 @@ class _Search:
         text = part.entry.column or ""
         stems = dict.fromkeys(self._found[part.key])
         if not stems:
-            found = f"no column that fits '{excerpt(text)}'"
-            raise LogError.at_field(part.where, found, join_names(self._unused(), MOST_LISTED))
+            reason = f"no column that fits '{excerpt(text)}'"
+            raise LogError.at_field(part.where, reason, join_names(self._unused(), MOST_LISTED))
         columns = tuple(column for stem in stems for column in _spell(part, text, 0, stem))
         before, after = self._around_name(part)
         labels = tuple(f"{before}{stem}{after}" for stem in stems)
@@ -318,10 +318,10 @@ class EntryReader:
         if array.dtype.kind == "U" and part.key == "contact_active":
             array = _flags_of_words(column, array)
         if array.dtype.kind not in "fiub":
-            found = f"values of type {array.dtype}"
+            reason = f"values of type {array.dtype}"
             if array.dtype.kind == "U" and array.ndim == 1 and len(array):
-                found = f"'{excerpt(str(array[0]))}'"
-            raise LogError.at_field(f"'{column}'", found, "real numbers")
+                reason = f"'{excerpt(str(array[0]))}'"
+            raise LogError.at_field(f"'{column}'", reason, "real numbers")
         names = (len(matched.labels),) if part.kind and not matched.by_name else ()
         shape = (*names, *([len(part.components)] if part.components and not matched.by_component else []))
         if isinstance(part.entry, Gains) and array.shape == shape:
@@ -650,8 +650,8 @@ def match_table(columns: Columns | None, header: Sequence[str], in_degrees: bool
         ]
         units = values_by_name(f"{part.where}.unit", part.entry.unit, turning)
         if without := [label for label in turning if label not in units]:
-            found = f"none of {without[0] or part.key}, in a file with inDegrees=yes"
-            raise LogError.at_field(f"{part.where}.unit", found, "deg, or deg/s, or rad, or m where nothing turns")
+            reason = f"none of {without[0] or part.key}, in a file with inDegrees=yes"
+            raise LogError.at_field(f"{part.where}.unit", reason, "deg, or deg/s, or rad, or m where nothing turns")
     return fields
 
 
@@ -745,8 +745,8 @@ def _require_once(matched: Mapping[str, Matched]) -> None:
     for key, match in matched.items():
         for column in match.columns:
             if column in owners:
-                found = f"column '{excerpt(column)}', which {KEY}.{owners[column]} has already"
-                raise LogError.at_field(match.part.where, found, "every column once")
+                reason = f"column '{excerpt(column)}', which {KEY}.{owners[column]} has already"
+                raise LogError.at_field(match.part.where, reason, "every column once")
             owners[column] = key
 
 
@@ -766,8 +766,8 @@ def _common_names(
         differing = again or sorted(lacking | set(of_part) - set(common))
         if differing:
             where = "twice" if again else "missing here" if differing[0] in common else "missing in other fields"
-            found = f"{KINDS[field]} '{excerpt(differing[0])}' {where}"
-            raise LogError.at_field(key, found, f"the same {KINDS[field]}s in all fields, each once")
+            reason = f"{KINDS[field]} '{excerpt(differing[0])}' {where}"
+            raise LogError.at_field(key, reason, f"the same {KINDS[field]}s in all fields, each once")
     return {**{field: of_file for field, of_file in named.items()}, **names}
 
 

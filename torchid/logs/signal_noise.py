@@ -188,7 +188,7 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline,
         )
         return
     names = [f"{name} ({100.0 * share:.0f} %)" for name, share, _ in noisy]
-    found = f"a large part of these accelerations is noise: {join_names(names, _NAMED)}"
+    reason = f"a large part of these accelerations is noise: {join_names(names, _NAMED)}"
     cutoff = timeline.cutoff_hz
     if cutoff is None:
         advice = "a low-pass filter, preprocessing.cutoff_hz"
@@ -198,7 +198,7 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline,
         ratios = _LITTLE / (1.0 - _LITTLE) * np.maximum(1.0 - shares, 1e-3) / shares
         lower = cutoff * float(np.median(ratios ** (1.0 / powers)))  # as channels may hardly move
         advice = f"a cutoff of {lower:.2g} Hz, if the motion is that slow, or faster motion"
-    warn_about_file(f"{found}; what rests on them is uncertain; accepted: {advice}")
+    warn_about_file(f"{reason}; what rests on them is uncertain; accepted: {advice}")
 
 
 def _stands_still(log: Log, noise: SignalNoise) -> bool:

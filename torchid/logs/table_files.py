@@ -21,7 +21,9 @@ from torchid.logs.log import TEXT_FIELD
 _BLOCK_BYTES = 2**22  # of text that is parsed at a time; no row may be longer
 _BATCH_ROWS = 2**16
 _SAMPLE_ROWS = 2**12
-_HEADER_LINES, _OPENSIM_LINES = 64, 1000  # before the first row
+# before the first row
+_HEADER_LINES = 64
+_OPENSIM_LINES = 1000
 _MAX_COLUMN_LETTERS = 2 * MAX_LETTERS  # the name of a column contains that of a joint
 _PARQUET = {  # limits on metadata: bytes of names and statistics, entries of lists
     "thrift_string_size_limit": 2**26,
@@ -45,8 +47,8 @@ def import_pyarrow(path: Path) -> Any:
     try:
         import pyarrow
     except ImportError as error:
-        found = f"a {path.suffix.lower()} file, but pyarrow is not installed"
-        raise LogError(path, "file", found, f"a .npz file, or {how_to_install('tables')}") from error
+        reason = f"a {path.suffix.lower()} file, but pyarrow is not installed"
+        raise LogError(path, "file", reason, f"a .npz file, or {how_to_install('tables')}") from error
     return pyarrow
 
 
@@ -152,9 +154,9 @@ def _line_of_names(path: Path, texts: Sequence[str], first: int) -> int | None:
     alike = [k for k in range(first) if len(_cells(_COMMENT.sub("", texts[k]).rstrip(separator), separator)) == count]
     named = next((k for k in alike if k in plain), (alike or plain)[-1] if alike or plain else None)
     if between := [k for k in plain if named is not None and k > named and not _count_numbers(texts[k])]:
-        found = f"'{excerpt(texts[between[0]])}' between the names and the first row"
+        reason = f"'{excerpt(texts[between[0]])}' between the names and the first row"
         accepted = "rows of numbers below the names; units go to logs.columns, and names in several lines into one"
-        raise LogError(path, f"line {between[0] + 1}", found, accepted)
+        raise LogError(path, f"line {between[0] + 1}", reason, accepted)
     return named
 
 
@@ -215,8 +217,8 @@ def check_column_names(names: Sequence[str]) -> None:
     seen = set[str]()
     for name in names:
         if len(name) > _MAX_COLUMN_LETTERS or not is_plain(name):
-            found = f"a name of {len(name)} characters: {excerpt(name)}"
-            raise LogError.at_field("header", found, f"names of one line and at most {_MAX_COLUMN_LETTERS} characters")
+            reason = f"a name of {len(name)} characters: {excerpt(name)}"
+            raise LogError.at_field("header", reason, f"names of one line and at most {_MAX_COLUMN_LETTERS} characters")
         if name in seen:
             raise LogError.at_field(f"column '{name}'", "given twice", "every column once")
         seen.add(name)
@@ -414,8 +416,8 @@ class _Served:
         if len(lengths) > 1 or (len(lengths) and lengths[0] != expected):
             if not self._origin.get(f"{name}[0]"):
                 return None  # lists of several lengths, which nobody may need
-            found = f"lists of {expected} and of {lengths[lengths != expected][0]} numbers"
-            raise LogError.at_field(f"column '{name}'", found, "lists of one length")
+            reason = f"lists of {expected} and of {lengths[lengths != expected][0]} numbers"
+            raise LogError.at_field(f"column '{name}'", reason, "lists of one length")
         if not 0 < expected <= MAX_LIST:
             return None
         flat = lists.drop_null().flatten().to_numpy(zero_copy_only=False)

@@ -89,8 +89,8 @@ def common_texts(blocks: Iterable[Arrays]) -> Arrays:
     for block in blocks:
         for name, array in block.items():
             if field_shape(name)[:1] != ("N",) and array.tolist() != out.setdefault(name, array).tolist():
-                found = f"'{out[name]}' and '{array}'"
-                raise LogError.at_field(f"column '{name}'", found, "one name, the same in every row")
+                reason = f"'{out[name]}' and '{array}'"
+                raise LogError.at_field(f"column '{name}'", reason, "one name, the same in every row")
     return out
 
 
@@ -138,8 +138,8 @@ def _fields(fields: FileFields, columns: Arrays) -> Arrays:
     if fields.frame_column:
         words = sorted(np.unique(columns[fields.frame_column]).tolist(), key=lambda word: not word)
         if len(words) > 1 or words == [""]:
-            found = " and ".join(f"'{excerpt(str(word))}'" if word else "an empty cell" for word in words[:2])
-            raise LogError.at_field(f"column '{TEXT_FIELD}'", found, "one name, the same in every row")
+            reason = " and ".join(f"'{excerpt(str(word))}'" if word else "an empty cell" for word in words[:2])
+            raise LogError.at_field(f"column '{TEXT_FIELD}'", reason, "one name, the same in every row")
         columns[fields.frame_column] = np.array(str(words[0]).strip() if words else "")
     out = fields.read(columns.pop)
     if not out["joint_names"].size:  # a robot without joints
@@ -221,8 +221,8 @@ def pivoted(columns: Mapping[str, NDArray[Any]], rows: RowNames) -> Arrays:
     samples = samples.reshape(-1)
     others = {name: x for name, x in columns.items() if name not in (rows.column, *rows.stamps) and _has_flags(x)}
     if len(others) * len(words) > MAX_COLUMNS:
-        found = f"{len(words)} names in {format_count(len(others), 'column')} of numbers"
-        raise LogError.at_field(f"column '{rows.column}'", found, f"at most {MAX_COLUMNS} columns in all")
+        reason = f"{len(words)} names in {format_count(len(others), 'column')} of numbers"
+        raise LogError.at_field(f"column '{rows.column}'", reason, f"at most {MAX_COLUMNS} columns in all")
     out = dict(zip(rows.stamps, keys.T, strict=True))
     again = len(samples) - len(np.unique(samples * len(words) + codes))
     for name, values in others.items():
@@ -237,8 +237,8 @@ def pivoted(columns: Mapping[str, NDArray[Any]], rows: RowNames) -> Arrays:
         other = ~((wide[samples, codes] == values) | np.isnan(values))
         if again and other.any():
             row = int(np.argmax(other))
-            found = f"two rows of '{excerpt(words[codes[row]])}' at {keys[samples[row]][0]:.10g}, with two of '{name}'"
-            raise LogError.at_field(f"column '{rows.column}'", found, "one row of each at each stamp")
+            reason = f"two rows of '{excerpt(words[codes[row]])}' at {keys[samples[row]][0]:.10g}, with two of '{name}'"
+            raise LogError.at_field(f"column '{rows.column}'", reason, "one row of each at each stamp")
         out |= {f"{name}.{word}": x for word, x in zip(words, np.ascontiguousarray(wide.T), strict=True)}
     if again:
         warn_about_file(f"{format_count(again, 'row')} of a joint and stamp that have one already: counted once")

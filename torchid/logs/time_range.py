@@ -87,9 +87,9 @@ class TimeRange:
         first, last = (int(np.searchsorted(since, bound - slack)) for bound in (start, stop))
         inside = -slack <= start and stop <= length + slack
         if not inside or first >= last:
-            found = f"{self.text} of a log that lasts {length:.6g} s ({len(time)} samples)"
-            found += ", without a sample in it" if inside else ""
-            raise LogError.at_field("time range", found, f"a part of 0 to {length:.6g} s that has samples")
+            reason = f"{self.text} of a log that lasts {length:.6g} s ({len(time)} samples)"
+            reason += ", without a sample in it" if inside else ""
+            raise LogError.at_field("time range", reason, f"a part of 0 to {length:.6g} s that has samples")
         return slice(first, last)
 
 
@@ -97,10 +97,10 @@ def _parse_bound(text: str, otherwise: _Bound) -> _Bound:
     """The bound that a text names, `otherwise` of an empty one; ValueError for anything else."""
     if not text:
         return otherwise
-    found = _BOUND.fullmatch(text)
-    if found is None:
+    match = _BOUND.fullmatch(text)
+    if match is None:
         raise ValueError(text)
-    sign, number, exponent, percent = found.groups()
+    sign, number, exponent, percent = match.groups()
     value = float(f"{number}e{exponent or 0}")
     if percent:
         if sign == "-" or value > 100.0:
@@ -134,8 +134,8 @@ class Recording:
         """
         starts = recording_starts(time)
         if self.number >= len(starts):
-            found = f"{self.text} of a file in which stamps begin {len(starts)} times"
-            raise LogError.at_field("recording", found, f"[#0] to [#{len(starts) - 1}]")
+            reason = f"{self.text} of a file in which stamps begin {len(starts)} times"
+            raise LogError.at_field("recording", reason, f"[#0] to [#{len(starts) - 1}]")
         return slice(*[*starts, len(time)][self.number : self.number + 2])
 
 
@@ -147,9 +147,9 @@ def recording_starts(time: FloatArray) -> list[int]:
 def each_recording(name: str) -> list[str]:
     """The names of the recordings that a name such as `walk.npz[#2:40]` stands for; itself for any other."""
     file, bracket, inside = name.rpartition("[")
-    if (found := _RECORDINGS.fullmatch(bracket + inside)) is None:
+    if (match := _RECORDINGS.fullmatch(bracket + inside)) is None:
         return [name]
-    first, stop = (int(x) for x in found.groups())
+    first, stop = (int(x) for x in match.groups())
     return [f"{file}[#{k}]" for k in range(first, min(stop, first + _MOST_RECORDINGS))]
 
 
@@ -202,14 +202,14 @@ def _split_files(path: Path) -> tuple[LogFile, ...]:
     first, *others = str(path).split(JOINED)
     if not others or not all(Path(text).suffix for text in (first, *others)) or os.path.lexists(path):
         return (LogFile(path),)
-    found = [_shifted(text) for text in (first, *others)]
-    folder = found[0].path.parent
-    return (found[0], *(LogFile(folder / file.path, file.shift_s) for file in found[1:]))
+    shifted = [_shifted(text) for text in (first, *others)]
+    folder = shifted[0].path.parent
+    return (shifted[0], *(LogFile(folder / file.path, file.shift_s) for file in shifted[1:]))
 
 
 def _shifted(text: str) -> LogFile:
-    found = _SHIFT.fullmatch(text)
-    return LogFile(Path(text)) if found is None else LogFile(Path(found[1]), float(found[2]))
+    match = _SHIFT.fullmatch(text)
+    return LogFile(Path(text)) if match is None else LogFile(Path(match[1]), float(match[2]))
 
 
 @dataclass(frozen=True)
@@ -264,8 +264,8 @@ def split_range(path: str | os.PathLike[str]) -> LogPart:
     file, bracket, inside = path.name.rpartition("[")
     if not inside.endswith("]") or not file or os.path.lexists(path):
         return LogPart(path, None)
-    if found := _RECORDING.fullmatch(bracket + inside):
-        return LogPart(path.with_name(file), Recording(bracket + inside, int(found[1])))
+    if match := _RECORDING.fullmatch(bracket + inside):
+        return LogPart(path.with_name(file), Recording(bracket + inside, int(match[1])))
     try:
         return LogPart(path.with_name(file), TimeRange.parse(bracket + inside))
     except ValueError as error:

@@ -273,9 +273,9 @@ def _resampled(
         raise InputError.at_field("preprocessing.sample_rate_hz", f"{sample_rate_hz:g}", accepted)
     output = _uniform(grid[kept], sample_rate_hz)
     if len(output) < 2:
-        found = f"{sample_rate_hz:g}, which leaves one sample"
+        reason = f"{sample_rate_hz:g}, which leaves one sample"
         accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
-        raise InputError.at_field("preprocessing.sample_rate_hz", found, accepted)
+        raise InputError.at_field("preprocessing.sample_rate_hz", reason, accepted)
     if (each := _share_kept(grid, 1.0 / sample_rate_hz)) is not None:  # no spline has to find what is there
         return slice(kept.start, kept.stop, each), None
     return kept, output
@@ -288,9 +288,9 @@ def _median_step(native: FloatArray) -> float:
     longest = int(np.argmax(steps))
     shortest = int(np.argmin(steps))
     if steps[longest] > LONGEST_STEP * step:
-        found = f"a step of {steps[longest]:.6g} s after sample {longest}"
+        reason = f"a step of {steps[longest]:.6g} s after sample {longest}"
         accepted = f"steps of at most {LONGEST_STEP:g} times the median of {step:.6g} s; split the log there"
-        raise LogError.at_field("time", found, accepted)
+        raise LogError.at_field("time", reason, accepted)
     if steps[shortest] < SHORTEST_STEP * step:
         what = f"a step of {steps[shortest]:.6g} s after sample {shortest}, the median being {step:.6g} s"
         warn_about_file(f"time: {what}: interpolation multiplies the noise there")

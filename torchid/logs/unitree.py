@@ -112,10 +112,10 @@ def require_joints_of(field: str, robot: str, joints: Collection[str]) -> None:
     """
     absent = [name for name in JOINT_ORDERS[robot].names if name not in joints]
     if absent:
-        found = f"'{robot}', whose joint '{absent[0]}' the robot has not"
+        reason = f"'{robot}', whose joint '{absent[0]}' the robot has not"
         accepted = ", ".join(suitable_orders(joints))
         accepted = accepted or "names of joints by number, as no robot known by name has these"
-        raise ConfigError.at_field(field, found, accepted)
+        raise ConfigError.at_field(field, reason, accepted)
 
 
 def robot_with_order(order: Collection[str | None] | None) -> str:

@@ -95,9 +95,9 @@ def unit_factor(key: str, unit: str, quantities: tuple[str, ...]) -> float:
         if plain in UNITS[quantity]:
             return UNITS[quantity][plain]
     others = [quantity for quantity, units in UNITS.items() if plain in units]
-    found = f"'{excerpt(unit)}', " + (f"a unit of {others[0]}" if others else "an unknown unit")
+    reason = f"'{excerpt(unit)}', " + (f"a unit of {others[0]}" if others else "an unknown unit")
     accepted = ", ".join(text for quantity in quantities for text in UNITS[quantity])
-    raise ConfigError.at_field(key, found, accepted or "no unit, as this is a number without one")
+    raise ConfigError.at_field(key, reason, accepted or "no unit, as this is a number without one")
 
 
 def quantities_with(unit: str) -> tuple[str, ...]:
@@ -111,11 +111,11 @@ def split_unit(column: str) -> tuple[str, str]:
 
     What brackets hold is a unit, known or not, unless it is a number or an axis; a suffix is one that is known.
     """
-    found = _BRACKETS.fullmatch(column)
-    if found:
-        inside = (found[2] or found[3] or "").strip()
-        return (column, "") if _INSIDE.fullmatch(inside) else (found[1], inside)
-    for start in (found.start() for found in re.finditer(r"[_ .](?=[^_ .])", column)):
+    match = _BRACKETS.fullmatch(column)
+    if match:
+        inside = (match[2] or match[3] or "").strip()
+        return (column, "") if _INSIDE.fullmatch(inside) else (match[1], inside)
+    for start in (match.start() for match in re.finditer(r"[_ .](?=[^_ .])", column)):
         text = column[start + 1 :].replace("_per_", "/")
         for unit in (text.replace("_", "/"), text.replace("_", "")):
             of_gyro = unit.strip() == "g" and column[:start].lower().endswith("imu")

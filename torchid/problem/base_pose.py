@@ -98,8 +98,8 @@ def base_pose_from_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> 
     """
     active = _standing_flags(log, contacts)
     if log.contact_wrench_world is not None:
-        found = "given, but preprocessing.base_motion: contacts knows no heading in the world"
-        raise LogError(log.source, "contact_wrench_world", found, "contact_wrench_local, or a log without wrenches")
+        refusal = "given, but preprocessing.base_motion: contacts knows no heading in the world"
+        raise LogError(log.source, "contact_wrench_world", refusal, "contact_wrench_local, or a log without wrenches")
     _require_floor_normals(log, active, contacts)
     with about_file(log.source):
         poses = feet_poses(log, robot, contacts)
@@ -144,14 +144,14 @@ def _require_some(source: str, active: BoolArray, known: BoolArray, few: int) ->
     if known.any():
         return
     if not active.any():
-        found = "no contact stands in any sample"
+        reason = "no contact stands in any sample"
     elif few == len(known):
         most = int(active.sum(axis=1).max())
-        found = f"at most {most} of the contacts stand at once"
+        reason = f"at most {most} of the contacts stand at once"
     else:
-        found = "the feet that stand are in a line, about which the base may turn"
+        reason = "the feet that stand are in a line, about which the base may turn"
     accepted = f"{FEET} on the floor, or preprocessing.base_motion: null for a log with the base's motion"
-    raise LogError(source, "contact_active", f"{found}, though preprocessing.base_motion is contacts", accepted)
+    raise LogError(source, "contact_active", f"{reason}, though preprocessing.base_motion is contacts", accepted)
 
 
 def _require_floor_normals(log: Log, active: BoolArray, contacts: Sequence[Contact]) -> None:
@@ -162,8 +162,8 @@ def _require_floor_normals(log: Log, active: BoolArray, contacts: Sequence[Conta
     columns = [log.contact_names.index(contact.frame) for contact in contacts]
     other = np.abs(normals[:, columns] - np.array([contact.normal for contact in contacts]))
     if (active & (other > _HEADING_TOLERANCE).any(axis=2)).any():
-        found = "other normals than that of the contacts, though preprocessing.base_motion is contacts"
-        raise LogError(log.source, NORMALS, found, "contacts[].normal of the one floor, or a log without the field")
+        reason = "other normals than that of the contacts, though preprocessing.base_motion is contacts"
+        raise LogError(log.source, NORMALS, reason, "contacts[].normal of the one floor, or a log without the field")
 
 
 def feet_poses(log: Log, robot: Robot, contacts: Sequence[Contact]) -> dict[str, FloatArray]:
@@ -216,9 +216,9 @@ def _sole_axis(contact: Contact, rotation: FloatArray, origin: FloatArray) -> in
     axis = int(share.argmax())
     if share[axis] < _ALONG:
         angle = float(np.degrees(np.arccos(share[axis])))
-        found = f"the base is {angle:.0f} deg off the nearest axis of flat foot {contact.frame}"
+        reason = f"the base is {angle:.0f} deg off the nearest axis of flat foot {contact.frame}"
         accepted = "a frame with an axis normal to the sole, below the base, for preprocessing.base_motion: contacts"
-        raise LogError.at_field("contact_names", found, accepted)
+        raise LogError.at_field("contact_names", reason, accepted)
     return axis
 
 

@@ -127,10 +127,10 @@ def _pieces(
 class _ProgressOfAll:
     """Reports samples as if all processes were as far as this one, to a callback that need not be thread-safe."""
 
-    def __init__(self, progress: ProgressCallback, total: int, own: int) -> None:
+    def __init__(self, progress: ProgressCallback, total: int, share: int) -> None:
         self._progress = progress
         self._total = total
-        self._own = own
+        self._own = share
         self._lock = threading.Lock()
         self._done = 0
         self._reported = 0

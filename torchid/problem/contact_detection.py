@@ -174,13 +174,13 @@ def detect_contacts(
     known = filtered(min(settings.cutoff_hz, 2.0 * _RATE_SHARE * nyquist_hz(log.time)))
     forces = ForcesAlongNormals.of(known, robot, contacts, sign_width)
     seen = _Seen.of(known, forces, settings)
-    found = seen.judged()
+    detection = seen.judged()
     time = seen.time
     if settings.refit and seen.accelerates:
-        found, time = _detect_again(filtered, forces, seen, found)
+        detection, time = _detect_again(filtered, forces, seen, detection)
     inside = (log.time >= time[0]) & (log.time <= time[-1])
     nearest = _nearest(time, log.time)
-    active, certain, possible, clear = (part[nearest] for part in found)
+    active, certain, possible, clear = (part[nearest] for part in detection)
     return Detection(active, inside & certain, possible, inside & clear)
 
 
@@ -259,20 +259,20 @@ class _Seen:
         twice as far away as the filter lets a scuff be seen: once around, a touch that is too light to be seen at its
         beginning is left in the air.
         """
-        found = self.judged(bounces=is_sharp)
+        detection = self.judged(bounces=is_sharp)
         factor = float(np.clip(_DEVIATIONS * self.noise(in_the_air) / self.settings.touch, _LOWEST, 1.0))
         lower = {name: factor * getattr(self.settings, name) for name in ("touch", "lift", "light")}
         finer = dataclasses.replace(self, settings=dataclasses.replace(self.settings, **lower)).judged()
-        certain = found.certain & finer.clear & (finer.active == found.active).all(axis=1)
-        possible = found.possible | finer.active
+        certain = detection.certain & finer.clear & (finer.active == detection.active).all(axis=1)
+        possible = detection.possible | finer.active
         if is_sharp:
             certain &= finer.certain
             possible = ~find_unloaded(self.time, possible | finer.possible, 2.0 * self.smear_s)
-        return Detection(finer.active, certain, possible, found.clear)
+        return Detection(finer.active, certain, possible, detection.clear)
 
 
 def _detect_again(
-    filtered: Callable[[float], DetectionSamples], forces: ForcesAlongNormals, seen: _Seen, found: Detection
+    filtered: Callable[[float], DetectionSamples], forces: ForcesAlongNormals, seen: _Seen, detection: Detection
 ) -> tuple[Detection, FloatArray]:
     """Contacts by parameters that fit the log, and the stamps (K,) [s] of the samples in which they are known.
 
@@ -283,13 +283,13 @@ def _detect_again(
         filtered: the log at a cutoff.
         forces: by the URDF.
         seen: with these, at the cutoff of the settings.
-        found: which contacts stand by these.
+        detection: which contacts stand by these.
     """
     time = seen.time
     sharp = seen.known
     lowest: float | None = None
-    air, ground = (find_unloaded(time, active, seen.smear_s) for active in (found.active, ~found.active))
-    again = _fitted(forces, found.active, found.certain & (air | ground).all(axis=1))
+    air, ground = (find_unloaded(time, active, seen.smear_s) for active in (detection.active, ~detection.active))
+    again = _fitted(forces, detection.active, detection.certain & (air | ground).all(axis=1))
     for more in reversed(range(_FITS)):
         if again is None:
             break
@@ -302,13 +302,13 @@ def _detect_again(
         sharp = best.known
         lowest = noise
         is_sharp = sharp.cutoff_hz > seen.known.cutoff_hz
-        found = best.finer(in_the_air, is_sharp)
+        detection = best.finer(in_the_air, is_sharp)
         if not is_sharp or not more:
             break
         by_urdf = ForcesAlongNormals.of(sharp, forces.robot, forces.contacts, forces.builder.tree.sign_width)
-        away = find_unloaded(time, ~found.clear[:, None], 2.0 * best.smear_s)[:, 0]
-        again = _fitted(by_urdf, found.possible, away)
-    return found, time
+        away = find_unloaded(time, ~detection.clear[:, None], 2.0 * best.smear_s)[:, 0]
+        again = _fitted(by_urdf, detection.possible, away)
+    return detection, time
 
 
 def _sharpest(
@@ -437,9 +437,9 @@ def _require_torques(log: Log, robot: Robot, contacts: Sequence[Contact], measur
             body = joint.parent
         of_contact = [name for name, known in zip(robot.joint_names, measured, strict=True) if known and name in above]
         if len(of_contact) < _FEWEST_TORQUES:
-            found = f"measured at {', '.join(of_contact) or 'no joint'} alone above {contact.frame}"
+            reason = f"measured at {', '.join(of_contact) or 'no joint'} alone above {contact.frame}"
             accepted = f"torques of {_FEWEST_TORQUES} joints or more above each contact, for detect_contacts"
-            raise LogError(log.source, "joint_torque", found, accepted)
+            raise LogError(log.source, "joint_torque", reason, accepted)
 
 
 def _for_detection(log: Log) -> Log:

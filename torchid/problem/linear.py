@@ -150,9 +150,9 @@ class LinearProblem:
         """Check types and shapes, and that all numbers are finite."""
         for name, kind in (("A", "f"), ("b", "f"), ("nominal", "f"), ("scale", "f"), ("free", "b")):
             if not isinstance(x := getattr(self, name), np.ndarray) or x.dtype.kind != kind:
-                found = f"{type(x).__name__} of {getattr(x, 'dtype', 'no dtype')}"
+                reason = f"{type(x).__name__} of {getattr(x, 'dtype', 'no dtype')}"
                 raise TypeError(
-                    f"{name}: found {found}; accepted: a NumPy array of {'bool' if kind == 'b' else 'floats'}"
+                    f"{name}: found {reason}; accepted: a NumPy array of {'bool' if kind == 'b' else 'floats'}"
                 )
         rows, columns = self.A.shape
         shapes = (self.b.shape, self.nominal.shape, self.scale.shape, self.free.shape)

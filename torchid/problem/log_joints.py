@@ -32,11 +32,11 @@ def joint_order(log: Log, robot: Robot) -> list[int]:
             raise UnknownNameError(log.source, "joint_names", name, robot.joint_names)
     lacking = [name for name in robot.joint_names if name not in log.joint_names]
     if lacking:
-        found = f"{join_names(lacking, _LISTED)} of {robot.path.name} missing"
+        reason = f"{join_names(lacking, _LISTED)} of {robot.path.name} missing"
         listed = ", ".join(lacking) if len(lacking) <= _LISTED else f"{lacking[0]}, ..."
         accepted = f"every joint that moves, or robot.weld: [{listed}] for those that are held"
         accepted += "; joints of loops follow from others that determine them" if robot.loops else ""
-        raise LogError(log.source, "joint_names", found, accepted)
+        raise LogError(log.source, "joint_names", reason, accepted)
     return [log.joint_names.index(name) for name in robot.joint_names]
 
 
@@ -62,9 +62,9 @@ def _with_passive(torque: FloatArray, log: Log, robot: Robot) -> FloatArray:
     driven = passive & (size > _NO_TORQUE)
     if driven.any():
         names = [robot.joint_names[joint] for joint in np.flatnonzero(driven)]
-        found = f"{join_names(names, _LISTED)}: up to {size[driven].max():.3g} N m, without a motor"
+        reason = f"{join_names(names, _LISTED)}: up to {size[driven].max():.3g} N m, without a motor"
         others = ", ".join(name for name in robot.passive if name not in names)
-        raise LogError(log.source, "joint_torque", found, f"0, NaN or none, or robot.passive: [{others}]")
+        raise LogError(log.source, "joint_torque", reason, f"0, NaN or none, or robot.passive: [{others}]")
     return np.where(passive, 0.0, torque)
 
 
@@ -177,8 +177,8 @@ def require_closed_loops(source: str, joint_position: torch.Tensor, robot: Robot
     for number, gap in enumerate(loop_gaps(robot, joint_position)):
         if gap.is_open:
             accepted = f"{gap.accepted} (its max_gap, max_angle): frames that coincide, and encoders without an offset"
-            found = f"{gap.loop.label} apart by {gap}"
-            raise LogError(source, f"{LOOPS_FIELD}[{number}]", found, accepted)
+            reason = f"{gap.loop.label} apart by {gap}"
+            raise LogError(source, f"{LOOPS_FIELD}[{number}]", reason, accepted)
 
 
 _FAR = 0.1  # rad or m, that joints move between samples which are found from the assembled posture
@@ -293,15 +293,15 @@ class _Joints:
         values = torch.linalg.svdvals(J)
         if J.shape[1] < len(self.missing) or bool((values[:, -1] <= _DETERMINED * values[:, 0]).all()):
             names = self._names(self.missing)
-            found = f"{names} of {self.robot.path.name} missing, which its loops do not determine"
-            raise LogError(self.log.source, "joint_names", found, "more joints of these loops")
+            reason = f"{names} of {self.robot.path.name} missing, which its loops do not determine"
+            raise LogError(self.log.source, "joint_names", reason, "more joints of these loops")
 
     def _require_closed(self, q: Tensor) -> None:
         for number, gap in enumerate(loop_gaps(self.robot, q)) if self._is_open(q).any() else ():
             if gap.largest > gap.loop.max_gap or gap.largest_angle > gap.loop.max_angle:
-                found = f"{gap.loop.label} apart by {gap}, whatever the positions of {self._names(self.missing)}"
+                reason = f"{gap.loop.label} apart by {gap}, whatever the positions of {self._names(self.missing)}"
                 accepted = f"{gap.accepted} in every sample: frames that coincide, and encoders without an offset"
-                raise LogError(self.log.source, f"{LOOPS_FIELD}[{number}]", found, accepted)
+                raise LogError(self.log.source, f"{LOOPS_FIELD}[{number}]", reason, accepted)
 
     def _names(self, joints: Sequence[int]) -> str:
         return join_names([self.robot.joint_names[k] for k in joints])

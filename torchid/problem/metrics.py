@@ -767,7 +767,7 @@ class WorseThanNominal:
         return describe_errors(self.group, self.identified, self.nominal) or self.group
 
 
-def describe_worse(groups: list[WorseThanNominal], of: str) -> str | None:
+def describe_worse(groups: list[WorseThanNominal], nominal_label: str) -> str | None:
     """One line that lists the groups, None if there are none.
 
     `of`: what the nominal parameters are those of, as `Robot.format`.
@@ -776,7 +776,7 @@ def describe_worse(groups: list[WorseThanNominal], of: str) -> str | None:
         return None
     by_logs = {group.logs: [str(other) for other in groups if other.logs == group.logs] for group in groups}
     texts_by_logs = "; ".join(f"on {logs}: {join_names(texts)}" for logs, texts in by_logs.items())
-    return f"the identified parameters predict worse than the {of}'s, {texts_by_logs}"
+    return f"the identified parameters predict worse than the {nominal_label}'s, {texts_by_logs}"
 
 
 def describe_errors(group: str, identified: float | None, nominal: float | None) -> str | None:

@@ -158,9 +158,9 @@ def position_for_moments(log: Log, robot: Robot, contacts: Sequence[Contact]) ->
         return torch.from_numpy(log.base_position_world)
     if robot.fixed_base and log.base_quat_xyzw is None:
         return torch.zeros(len(log), 3, dtype=torch.float64)
-    found = "given without base_position_world, by which moments are moved to the contact frames"
+    reason = "given without base_position_world, by which moments are moved to the contact frames"
     accepted = "base_position_world and the base's orientation in the same world, or moments about the frames' origins"
-    raise LogError(log.source, POINTS, found, accepted)
+    raise LogError(log.source, POINTS, reason, accepted)
 
 
 def _links_on_base(robot: Robot) -> list[str]:
@@ -186,8 +186,8 @@ def imu_pose(log: Log, robot: Robot) -> tuple[Rotation, Array]:
         body = joint.parent
         T_base_imu = joint.T_parent_joint @ joint.T_joint_link @ T_base_imu
     if body != 0:
-        found = f"'{log.imu_frame}', which moves with {robot.bodies[body].name}"
-        raise LogError(log.source, "imu_frame", found, f"a frame on the base: {', '.join(_links_on_base(robot)[:8])}")
+        reason = f"'{log.imu_frame}', which moves with {robot.bodies[body].name}"
+        raise LogError(log.source, "imu_frame", reason, f"a frame on the base: {', '.join(_links_on_base(robot)[:8])}")
     return Rotation.from_matrix(T_base_imu[:3, :3]), T_base_imu[:3, 3]
 
 

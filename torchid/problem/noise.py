@@ -114,7 +114,7 @@ class SampledRows:
         drawn = list(_random_chunks(logs, *self._drawn))
         for samples, state in drawn:
             builder.layout_of(samples, state)
-        self.chunks = map_in_workers(drawn, lambda one: self._chunk(*one), worker_count(builder.device))
+        self.chunks = map_in_workers(drawn, lambda drawn_chunk: self._chunk(*drawn_chunk), worker_count(builder.device))
         elsewhere = any(isinstance(log, LogOfOtherProcess) for log in logs)
         if any(distributed.all_gather(elsewhere, "logs that others have")):
             self.chunks = list(chain.from_iterable(distributed.all_gather(self.chunks, "samples for the noise")))
@@ -534,8 +534,8 @@ class VarianceComponentEstimator:
             leverage = (white.sources[::_THINNED] @ fitted).square().sum((0, 2))
             return leverage, sizes[::_THINNED].sum(0), (sizes > _NEGLIGIBLE).sum(0)
 
-        for chunk, found in zip(rows.chunks, map_in_workers(rows.chunks, of_chunk), strict=True):
-            leverage, sizes, count = (x.numpy() for x in found)
+        for chunk, residuals in zip(rows.chunks, map_in_workers(rows.chunks, of_chunk), strict=True):
+            leverage, sizes, count = (x.numpy() for x in residuals)
             np.add.at(leverages, group_of, chunk.oversampling * leverage)
             np.add.at(size, group_of, sizes)
             np.add.at(readings, group_of, count / chunk.oversampling)
@@ -585,18 +585,18 @@ def fitted_directions(assembly: Assembly, builder: RowBuilder, log: str) -> Tens
     scale = problem.scale[problem.free]
     _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=False, lapack_driver="gesvd")
     kept = is_significant(values)
-    found = np.zeros((len(problem.nominal), int(kept.sum())))
-    found[problem.free] = scale[:, None] * Vh[kept].T / values[kept]
+    directions = np.zeros((len(problem.nominal), int(kept.sum())))
+    directions[problem.free] = scale[:, None] * Vh[kept].T / values[kept]
     places = {extra.label: builder.columns.count + number for number, extra in enumerate(builder.extras)}
     eliminations = sorted((x for x in assembly.eliminations if x.log in ("", log)), key=lambda x: x.log != "")
     extras: list[tuple[int, Array]] = []
     for elimination in eliminations:  # those of all logs first, which those of a log depend on
-        values_of = np.hstack([-elimination.inverse @ elimination.C @ found, elimination.inverse])
+        values_of = np.hstack([-elimination.inverse @ elimination.C @ directions, elimination.inverse])
         extras += zip((places[extra.label] for extra in elimination.extras), values_of, strict=True)
-        found = np.pad(found, ((0, 0), (0, elimination.inverse.shape[1])))
-        found = found if elimination.log else np.vstack([found, values_of])
-    G = np.zeros((builder.width, found.shape[1]))
-    G[: builder.columns.count] = builder.columns.parameter_map @ found[: len(problem.nominal)]
+        directions = np.pad(directions, ((0, 0), (0, elimination.inverse.shape[1])))
+        directions = directions if elimination.log else np.vstack([directions, values_of])
+    G = np.zeros((builder.width, directions.shape[1]))
+    G[: builder.columns.count] = builder.columns.parameter_map @ directions[: len(problem.nominal)]
     for place, row in extras:
         G[place, : len(row)] = row
     return torch.from_numpy(G)

@@ -323,10 +323,10 @@ def _contact_normals(
     if base.quat_xyzw is None and not robot.fixed_base:
         first = grounded[0]
         does = f"radius {first.radius:g} m) rolls" if first.radius else f"sensor {NORMAL_FORCE}) stands"
-        found = f"missing, though {first.frame} ({does} on ground that is known in the world"
+        reason = f"missing, though {first.frame} ({does} on ground that is known in the world"
         otherwise = "radius: 0 for this contact" if first.radius else f"sensors without {NORMAL_FORCE}"
         accepted = f"base_quat_wxyz or base_quat_xyzw beside the IMU, or {otherwise}"
-        raise LogError(log.source, "base_quat_xyzw", found, accepted)
+        raise LogError(log.source, "base_quat_xyzw", reason, accepted)
     if log.contact_normal_world is None:
         return None
     with about_file(log.source):
@@ -414,10 +414,10 @@ def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], 
         bad = ~torch.isfinite(samples.torque) & torch.from_numpy(required.torque)
         if bad.any():
             sample, dof = torch.nonzero(bad)[0].tolist()
-            found = f"not a finite number at sample {sample} ({int(bad[:, dof].sum())} in all)"
-            found = "NaN in all samples of the fit" if bad[:, dof].all() else found
+            reason = f"not a finite number at sample {sample} ({int(bad[:, dof].sum())} in all)"
+            reason = "NaN in all samples of the fit" if bad[:, dof].all() else reason
             field = "ft_wrench" if dof >= robot.n else "joint_torque"
-            raise LogError(samples.source, f"{field} '{robot.dof_names[dof]}'", found, _AS_MEASURED)
+            raise LogError(samples.source, f"{field} '{robot.dof_names[dof]}'", reason, _AS_MEASURED)
     needed = recorded_components(contacts, required, samples.wrench_in_world)
     if needed.any() and samples.active.any():
         if samples.wrench is None:
@@ -430,21 +430,21 @@ def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], 
             sample, contact, k = torch.nonzero(bad)[0].tolist()
             if contacts[contact].along_normal:
                 raise _scalar_error(samples, contacts[contact].frame, sample, k)
-            found = f"{WRENCH_COMPONENTS[k]} is not a finite number at sample {sample}, while in contact"
+            reason = f"{WRENCH_COMPONENTS[k]} is not a finite number at sample {sample}, while in contact"
             field = f"contact_wrench '{contacts[contact].frame}'"
-            raise LogError(samples.source, field, found, _AS_MEASURED)
+            raise LogError(samples.source, field, reason, _AS_MEASURED)
 
 
 def _scalar_error(samples: Samples, frame: str, sample: int, k: int) -> LogError:
     """What is missing of a contact that is read along the ground's normal."""
     field = f"{FORCE_NORMAL} '{frame}'"
     if k != NORMAL_INDEX:
-        found = f"no {WRENCH_COMPONENTS[k]}: the contact is read along the ground's normal"
-        return LogError(samples.source, field, found, f"contact_wrenches: {{{frame}: [{NORMAL_FORCE}]}}")
+        reason = f"no {WRENCH_COMPONENTS[k]}: the contact is read along the ground's normal"
+        return LogError(samples.source, field, reason, f"contact_wrenches: {{{frame}: [{NORMAL_FORCE}]}}")
     if not samples.has_force_normal:
         return LogError(samples.source, field, "missing", f"the field, or sensors without {NORMAL_FORCE}")
-    found = f"not a finite number at sample {sample}, while in contact"
-    return LogError(samples.source, field, found, _AS_MEASURED)
+    reason = f"not a finite number at sample {sample}, while in contact"
+    return LogError(samples.source, field, reason, _AS_MEASURED)
 
 
 _MIN_ACCELERATION = 0.1 * GRAVITY  # [m/s^2] rms, of a base that is shaken; noise of a pose in half a millimetre: 0.4

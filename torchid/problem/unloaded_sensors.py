@@ -126,9 +126,9 @@ def zero_in_air(log: Log, contacts: Sequence[Contact]) -> Log:
     wrench = log.contact_wrench
     scalar = log.contact_force_normal
     if log.contact_wrench_world is not None and not log.moments_about_world_origin:
-        found = f"given with {_KEY}, though no offset is constant along the world's axes of a sensor that moves"
+        reason = f"given with {_KEY}, though no offset is constant along the world's axes of a sensor that moves"
         accepted = f"{WRENCHES[0]} or {FORCE_NORMAL}; of force plates {POINTS}, or logs.columns.plates"
-        raise LogError(log.source, WRENCHES[1], found, accepted)
+        raise LogError(log.source, WRENCHES[1], reason, accepted)
     if wrench is None and scalar is None:
         raise LogError(log.source, WRENCHES[0], "missing", f"readings of contacts, which {_KEY} is for")
     count = len(log.contact_names)
@@ -159,19 +159,19 @@ def zero_in_air(log: Log, contacts: Sequence[Contact]) -> Log:
 def _require_readings(log: Log, frame: str, component: int, count: int) -> None:
     """Refuse a channel that was read less often in the air than a mean needs."""
     if count < LEAST_READINGS:
-        found = f"{count} readings of {frame} in the air, more than {UNLOADED_MARGIN_S:g} s from contact"
+        reason = f"{count} readings of {frame} in the air, more than {UNLOADED_MARGIN_S:g} s from contact"
         accepted = f"{LEAST_READINGS} or more for {_KEY}, or {_FITTED}"
-        raise LogError(log.source, FORCE_NORMAL if component == 6 else log.contact_wrench_field, found, accepted)
+        raise LogError(log.source, FORCE_NORMAL if component == 6 else log.contact_wrench_field, reason, accepted)
 
 
 def _warn_of_offsets(log: Log, offsets: FloatArray, masked: Sequence[str]) -> None:
     """Warn of offsets (C, 7) that were subtracted, and of contacts whose readings are masked."""
     units = ((slice(0, 3), "N"), (slice(3, 6), "N m"), (slice(6, 7), "N along the normal"))
     texts = [
-        f"{name} {', '.join(f'{x:.3g}' for x in own[part])} {unit}"
-        for name, own in zip(log.contact_names, offsets, strict=True)
+        f"{name} {', '.join(f'{x:.3g}' for x in offset[part])} {unit}"
+        for name, offset in zip(log.contact_names, offsets, strict=True)
         for part, unit in units
-        if own[part].any()
+        if offset[part].any()
     ]
     if texts:
         warn(f"{log.source}: {_KEY} has subtracted {'; '.join(texts)}")

@@ -95,11 +95,11 @@ def is_measured(words: Sequence[str]) -> bool:
 
 def quantity_of(words: Sequence[str], unit: str = "") -> str:
     """The one quantity that words, from `join_pairs`, name, else that of a unit of hinges; "" for none or several."""
-    found = {QUANTITIES[word] for word in words if word in QUANTITIES}
-    found = found - {"wrench", "flag"} or found  # of contact/force, wrench.torque
-    if not found:
+    quantities = {QUANTITIES[word] for word in words if word in QUANTITIES}
+    quantities = quantities - {"wrench", "flag"} or quantities  # of contact/force, wrench.torque
+    if not quantities:
         return next((_OF_UNITS[x] for x in quantities_with(unit) if x in _OF_UNITS), "")
-    return found.pop() if len(found) == 1 else ""
+    return quantities.pop() if len(quantities) == 1 else ""
 
 
 def propose_field(column: str) -> str:

@@ -124,9 +124,9 @@ class LogReader:
         size_gb = self._size_gb(path)
         self.excluded.pop(str(path), None)
         if size_gb > limit_gb and split_range(path).joins:
-            found = f"several files with arrays of {size_gb:.2g} GB, which are not in memory at once"
+            reason = f"several files with arrays of {size_gb:.2g} GB, which are not in memory at once"
             needed = f"a preprocessing.memory_gb above {size_gb:.2g}"
-            raise LogError(path, "file", found, f"{needed}, or the one file that torchid convert makes of them")
+            raise LogError(path, "file", reason, f"{needed}, or the one file that torchid convert makes of them")
         has_parts = size_gb > limit_gb or has_blocks(path, None if files is None else files.columns)
         if size_gb > limit_gb / _COPIES and has_parts:
             samples = self._in_parts(path, required)
@@ -139,12 +139,12 @@ class LogReader:
                 self._held_gb = together_gb or samples.nbytes / GIGABYTE  # that of a bag is not known before
         if not len(samples):
             margin_s = self.setup.config.preprocessing.margin_s or 0.0
-            found = f"no sample further than {margin_s:g} s from a change of contact"
+            reason = f"no sample further than {margin_s:g} s from a change of contact"
             accepted = "a smaller preprocessing.contact_margin_s"
             if self._checks_slip:
-                found = f"{found} in which no contact slips"
+                reason = f"{reason} in which no contact slips"
                 accepted = "a larger preprocessing.max_slip, or a smaller contact_margin_s"
-            raise LogError(path, "contact_active", found, accepted)
+            raise LogError(path, "contact_active", reason, accepted)
         return samples
 
     def _size_gb(self, path: Path) -> float:
@@ -194,9 +194,9 @@ class LogReader:
         by_feet = settings.base_motion is not None or (settings.detect_contacts is not None and not measured)
         if by_feet and any(contact.normal != UP for contact in self.setup.contacts):
             setting = "detect_contacts" if settings.base_motion is None else "base_motion: contacts"
-            found = f"unknown, with {setting} on a tilted floor in a log that is not in memory at once"
+            reason = f"unknown, with {setting} on a tilted floor in a log that is not in memory at once"
             accepted = "the base's orientation or an IMU, a larger preprocessing.memory_gb, or parts of the log"
-            raise LogError(blocks.source, "base_quat_xyzw", found, accepted)
+            raise LogError(blocks.source, "base_quat_xyzw", reason, accepted)
 
     # --------------------------------------------------------------------------------- the steps of a log in memory
 
@@ -375,8 +375,8 @@ def check_read(logs: Mapping[str, Sequence[Samples]]) -> None:
     train = logs.get("train", ())
     bolted = [log for log in train if log.base.specific_force is None and log.resting is not None]
     if train and len(bolted) == len(train) and all(bool(x.resting.all()) for x in bolted if x.resting is not None):
-        found = "true, but all joints are at rest, or too near to it for the filter, throughout"
-        raise LogError(train[0].source, "actuators.stiction", found, "logs whose joints move, or false")
+        reason = "true, but all joints are at rest, or too near to it for the filter, throughout"
+        raise LogError(train[0].source, "actuators.stiction", reason, "logs whose joints move, or false")
     parts = {key: [split_range(log.source) for log in of_key] for key, of_key in logs.items()}
     spans = {split_range(log.source): log.time[[0, -1]].tolist() for of_key in logs.values() for log in of_key}
 

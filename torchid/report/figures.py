@@ -61,7 +61,7 @@ def parameter_figure(
     nominal: Array,
     estimate: Estimate,
     kinds: Collection[str] = ("revolute", "prismatic"),
-    of: str = "URDF",
+    nominal_label: str = "URDF",
 ) -> Figure:
     """Mass, first moment, inertia and friction of every body with a free parameter.
 
@@ -73,7 +73,7 @@ def parameter_figure(
         nominal: (L, 12), the URDF's parameters.
         estimate: the fit.
         kinds: of the robot's joints, which friction has the unit of.
-        of: what the nominal parameters are from.
+        nominal_label: what the nominal parameters are from.
     """
     verdict = estimate.verdict.reshape(-1, PER_BODY)
     shown = np.flatnonzero((verdict != FIXED).any(axis=1))
@@ -100,7 +100,7 @@ def parameter_figure(
     first = axes[titles[0]]
     label_ticks(first.yaxis, range(len(shown)), names, fontsize=7)
     first.set_ylim(len(shown) - 0.4, -0.6)
-    figure.legend(handles=_legend(first, of, bool(impossible.any())), loc="outside upper right", ncols=4)
+    figure.legend(handles=_legend(first, nominal_label, bool(impossible.any())), loc="outside upper right", ncols=4)
     return figure
 
 
@@ -124,10 +124,10 @@ def _draw(axis: Axes, before: Array, after: Array, known: np.ndarray, bars: Arra
     axis.plot(after[negative], rows[negative] + 0.16, "X", color=MEASURED_COLOR, markersize=6, zorder=3)
 
 
-def _legend(axis: Axes, of: str, impossible: bool) -> list[matplotlib.artist.Artist]:
+def _legend(axis: Axes, nominal_label: str, impossible: bool) -> list[matplotlib.artist.Artist]:
     """Handles with labels, drawn outside of what is seen."""
-    kinds = [("D", NOMINAL_COLOR, "none", of), ("o", IDENTIFIED_COLOR, IDENTIFIED_COLOR, "identified, 95 %")]
-    kinds.append(("o", IDENTIFIED_COLOR, "white", f"known in sums, or the {of}'s"))
+    kinds = [("D", NOMINAL_COLOR, "none", nominal_label), ("o", IDENTIFIED_COLOR, IDENTIFIED_COLOR, "identified, 95 %")]
+    kinds.append(("o", IDENTIFIED_COLOR, "white", f"known in sums, or the {nominal_label}'s"))
     if impossible:
         kinds.append(("X", MEASURED_COLOR, MEASURED_COLOR, "cannot exist"))
     return [
@@ -310,14 +310,14 @@ Position = tuple[float, int]
 
 
 @matplotlib.rc_context(STYLE)
-def error_figure(sets: Mapping[str, Comparison[Metrics]], of: str = "URDF") -> Figure:
+def error_figure(sets: Mapping[str, Comparison[Metrics]], nominal_label: str = "URDF") -> Figure:
     """Relative error by group of rows, nominal (`of` what) against identified, one panel per set of logs."""
     figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
         groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
         index = np.arange(len(groups))
-        pairs = ((-0.2, nominal, NOMINAL_COLOR, of), (0.2, identified, IDENTIFIED_COLOR, "identified"))
+        pairs = ((-0.2, nominal, NOMINAL_COLOR, nominal_label), (0.2, identified, IDENTIFIED_COLOR, "identified"))
         for shift, metrics, color, label in pairs:
             heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
             bars = axis.bar(index + shift, heights, 0.38, color=color, label=label)
@@ -544,7 +544,7 @@ _WIDE_RATIO = 5.0  # ratio of errors from which on decades tell more than differ
 
 
 @matplotlib.rc_context(STYLE)
-def ridge_figure(choice: RidgeChoice, of: str = "URDF") -> Figure:
+def ridge_figure(choice: RidgeChoice, nominal_label: str = "URDF") -> Figure:
     """Mean square of whitened residuals on held-out folds by ridge, on logarithmic axes.
 
     The band is a standard error of the difference from the least, fold by fold, on either side; ridges where it reaches
@@ -584,7 +584,7 @@ def ridge_figure(choice: RidgeChoice, of: str = "URDF") -> Figure:
     if axes.get_yscale() == "log":
         label_decades(axes.yaxis)
     axes.set_xlim(tried[shown].min() / 2.0, tried[shown].max() * 2.0)
-    axes.set_xlabel(f"ridge: weight of the {of} against the mean square of the rows [1]")
+    axes.set_xlabel(f"ridge: weight of the {nominal_label} against the mean square of the rows [1]")
     axes.set_ylabel("mean square of whitened residuals\non held-out folds [noise²]")
     figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8)
     figure.suptitle("Ridge by cross-validation", x=0.01, ha="left")
@@ -602,7 +602,7 @@ def drift_figure(
     ranges: Mapping[str, Array],
     by_joint: Mapping[str, Comparison[float]],
     units: Sequence[str],
-    of: str,
+    nominal_label: str,
 ) -> Figure:
     """Drift over the time since the beginning of a window, median and quartiles, and at its end by joint.
 
@@ -615,7 +615,7 @@ def drift_figure(
         ranges: least and largest median of robots that were drawn, (2, T), by what drifts; empty without any.
         by_joint: at the end of the windows.
         units: of the joints, "rad" or "m".
-        of: what the robot's file is.
+        nominal_label: what the robot's file is.
     """
     tall = max(0.22 * len(by_joint) + 1.4, 1.9 * len(quartiles) + 0.8)
     figure = Figure(figsize=(11.0, tall), layout="constrained")
@@ -623,7 +623,7 @@ def drift_figure(
     for row, (name, (nominal, identified)) in enumerate(quartiles.items()):
         axis = figure.add_subplot(grid[row, 0])
         for label, color, (low, middle, high) in (
-            (of, NOMINAL_COLOR, nominal),
+            (nominal_label, NOMINAL_COLOR, nominal),
             ("identified", IDENTIFIED_COLOR, identified),
         ):
             axis.fill_between(time, low, high, color=color, alpha=0.2, linewidth=0.0)

@@ -66,7 +66,11 @@ class ForceSeries:
 
 
 def force_figure(
-    series: ForceSeries, dof_names: Sequence[str], base_rows: int, sliding: Collection[str] = (), of: str = "URDF"
+    series: ForceSeries,
+    dof_names: Sequence[str],
+    base_rows: int,
+    sliding: Collection[str] = (),
+    nominal_label: str = "URDF",
 ) -> Figure:
     """Forces over time, and beside them their errors: the largest base force and moment, then the largest others.
 
@@ -76,7 +80,7 @@ def force_figure(
     known = int(np.isfinite(series.measured).any(axis=0).sum())
     shown = f" ({len(names)} of {known} rows, the largest)" if len(names) < known else ""
     gaps = "; gaps: forces without a sensor act" if np.isnan(series.measured[:, list(names)]).any() else ""
-    return _figure(series, names, f"Generalized forces{shown}, {series.source}", of, gaps)
+    return _figure(series, names, f"Generalized forces{shown}, {series.source}", nominal_label, gaps)
 
 
 @matplotlib.rc_context(STYLE)
@@ -84,7 +88,7 @@ def _figure(
     series: ForceSeries,
     rows: Mapping[int, tuple[str, str]],
     title: str,
-    of: str,
+    nominal_label: str,
     gaps: str = "",
     states: Sequence[Patch] = (),
 ) -> Figure:
@@ -100,7 +104,7 @@ def _figure(
     for (forces, errors), (row, (name, unit)) in zip(axes, rows.items(), strict=False):
         for values, color, width, label in (
             (series.measured, MEASURED_COLOR, 1.6, "measured"),
-            (series.nominal, NOMINAL_COLOR, 1.0, f"predicted, {of}"),
+            (series.nominal, NOMINAL_COLOR, 1.0, f"predicted, {nominal_label}"),
             (series.identified, IDENTIFIED_COLOR, 1.0, "predicted, identified"),
         ):
             forces.plot(thin.time, thin(values[:, row]), color=color, linewidth=width, label=label)
@@ -119,10 +123,10 @@ def _figure(
     return figure
 
 
-def pressure_figure(points: ForceSeries, of: str = "URDF") -> Figure:
+def pressure_figure(points: ForceSeries, nominal_label: str = "URDF") -> Figure:
     """As `force_figure`, of centres of pressure from the base link's origin in the place of forces."""
     rows = {0: ("along the base's x axis", "m"), 1: ("along its y axis", "m")}
-    return _figure(points, rows, f"Centre of pressure from the base link's origin, {points.source}", of)
+    return _figure(points, rows, f"Centre of pressure from the base link's origin, {points.source}", nominal_label)
 
 
 def _from_its_start(series: ForceSeries) -> tuple[ForceSeries, str]:
@@ -188,7 +192,11 @@ class LogForces:
 
 
 def rows_figure(
-    forces: LogForces, dof_names: Sequence[str], base_rows: int, sliding: Collection[str] = (), of: str = "URDF"
+    forces: LogForces,
+    dof_names: Sequence[str],
+    base_rows: int,
+    sliding: Collection[str] = (),
+    nominal_label: str = "URDF",
 ) -> Figure:
     """As `force_figure`, in the rows of the fit over the whole log; colours behind them are contact states."""
     series = replace(forces.projected, time=forces.projected.time - forces.projected.time[0])
@@ -198,7 +206,7 @@ def rows_figure(
     colored = np.argsort(lasted)[::-1][1:].tolist()  # the longest stays white
     colors = {k: CATEGORY_COLORS[place % len(CATEGORY_COLORS)] for place, k in enumerate(colored)}
     patches = [Patch(color=color, alpha=0.25, label=forces.states[k]) for k, color in colors.items()]
-    figure = _figure(series, names, f"Rows of the fit, {series.source}", of, states=patches[:_NAMED_STATES])
+    figure = _figure(series, names, f"Rows of the fit, {series.source}", nominal_label, states=patches[:_NAMED_STATES])
     for state, color in colors.items():
         stays = [(start, end - start) for start, end, number in spans if number == state]
         for axis in figure.axes:
@@ -209,7 +217,11 @@ def rows_figure(
 
 @matplotlib.rc_context(STYLE)
 def spectrum_figure(
-    forces: LogForces, dof_names: Sequence[str], base_rows: int, sliding: Collection[str] = (), of: str = "URDF"
+    forces: LogForces,
+    dof_names: Sequence[str],
+    base_rows: int,
+    sliding: Collection[str] = (),
+    nominal_label: str = "URDF",
 ) -> Figure:
     """Amplitude densities of the errors in the rows of the fit, and that of the readings' noise."""
     series = forces.projected
@@ -227,7 +239,7 @@ def spectrum_figure(
     axes = grid.ravel()
     for axis, (row, spectrum) in zip(axes, shown.items(), strict=False):
         for density, color, label in (
-            (spectrum.nominal, NOMINAL_COLOR, f"error, {of}"),
+            (spectrum.nominal, NOMINAL_COLOR, f"error, {nominal_label}"),
             (spectrum.identified, IDENTIFIED_COLOR, "error, identified"),
         ):
             axis.plot(spectrum.frequency, density, color=color, linewidth=1.2, label=label)

@@ -159,8 +159,8 @@ def _armature_of_mimics(robot: Robot) -> dict[str, float]:
 
 def require_loadable(text: bytes, source: Path) -> None:
     """Make sure that MuJoCo takes a model. Raises InputError: it does not."""
-    if found := mujoco_error(text, source.parent):
-        raise InputError(source, "MJCF", f"MuJoCo refuses it: {found}", "a robot that MuJoCo can simulate")
+    if refusal := mujoco_error(text, source.parent):
+        raise InputError(source, "MJCF", f"MuJoCo refuses it: {refusal}", "a robot that MuJoCo can simulate")
 
 
 _MESHES = (".stl", ".obj")  # that MuJoCo reads

@@ -105,14 +105,17 @@ def make_table(
     return table
 
 
-def error_tables(columns: Mapping[str, Comparison[Metrics]], of: str) -> list[Table]:
+def error_tables(columns: Mapping[str, Comparison[Metrics]], nominal_label: str) -> list[Table]:
     """Errors of predicted forces, nominal (`of` a URDF or MJCF) against identified, two sets of logs to a table."""
     sets = list(columns.items())
-    return [_error_table(dict(sets[i : i + 2]), of) for i in range(0, len(sets), 2)]
+    return [_error_table(dict(sets[i : i + 2]), nominal_label) for i in range(0, len(sets), 2)]
 
 
-def _error_table(columns: Mapping[str, Comparison[Metrics]], of: str) -> Table:
-    headings = ["", *(f"{name}\n{parameter_set}" for name in columns for parameter_set in (of, "identified"))]
+def _error_table(columns: Mapping[str, Comparison[Metrics]], nominal_label: str) -> Table:
+    headings = [
+        "",
+        *(f"{name}\n{parameter_set}" for name in columns for parameter_set in (nominal_label, "identified")),
+    ]
     identified = [pair.identified for pair in columns.values()]
     groups = ERROR_GROUPS | (LIMB_GROUPS if any("ft_force" in x.rms for x in identified) else {})
     groups |= PRESSURE_GROUP if any(PRESSURE in x.rms for x in identified) else {}
@@ -411,13 +414,13 @@ def rows_within(
     return lines if count <= most else [*lines, f"and {count - most} {others}"]
 
 
-def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int, of: str) -> list[str]:
+def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int, nominal_label: str) -> list[str]:
     """A small table of the errors of an `ErrorComparison`, not wider than so many columns; none without errors.
 
     `of`: what the nominal parameters are those of.
     """
     columns = [
-        (of, [f"{before:.4g}" for _, before, _, _ in errors]),
+        (nominal_label, [f"{before:.4g}" for _, before, _, _ in errors]),
         ("identified", [f"{after:.4g}" for _, _, after, _ in errors]),
         ("noise alone", ["" if floor is None else f"{floor:.4g}" for *_, floor in errors]),
     ]

@@ -137,20 +137,20 @@ class Projection(nn.Module):
         for name, x in batch.items():
             if not isinstance(x, Tensor):
                 raise TypeError(f"{name}: found {type(x).__name__}; accepted: a tensor")
-        found = [tuple(x.shape) for x in batch.values()]
+        shapes = [tuple(x.shape) for x in batch.values()]
         rows = len(self.get_buffer("kept"))
         k = len(self.get_buffer("wrench_measured"))
         K = batch["K"]
-        B = found[0][:1]
+        B = shapes[0][:1]
         n = rows - self.base_rows
-        if K.ndim != 3 or found != [(*B, k, rows), (*B, k), (*B, rows, K.shape[2]), (*B, n), (*B, k)]:
+        if K.ndim != 3 or shapes != [(*B, k, rows), (*B, k), (*B, rows, K.shape[2]), (*B, n), (*B, k)]:
             accepted = f"(B, {k}, {rows}), (B, {k}), (B, {rows}, P), (B, {n}), (B, {k})"
-            raise ValueError(f"{', '.join(batch)}: found shapes {', '.join(map(str, found))}; accepted: {accepted}")
+            raise ValueError(f"{', '.join(batch)}: found shapes {', '.join(map(str, shapes))}; accepted: {accepted}")
         for name, x in batch.items():
             expected = torch.bool if name == "active" else K.dtype
             if x.dtype != expected:
-                of = "" if name == "active" else ", as of K"
-                raise TypeError(f"{name}: found {x.dtype}; accepted: {expected}{of}")
+                suffix = "" if name == "active" else ", as of K"
+                raise TypeError(f"{name}: found {x.dtype}; accepted: {expected}{suffix}")
 
     def _state(
         self, index: Tensor, state: Tensor, J: Tensor, K: Tensor, torque: Tensor, wrench: Tensor

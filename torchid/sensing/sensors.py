@@ -198,7 +198,7 @@ class SensorNoise:
     def scaled(self, factor: float) -> SensorNoise:
         """All standard deviations times a factor."""
         scaled: dict[str, Any] = {
-            name: tuple(factor * one for one in x) if isinstance(x, tuple) else factor * x
+            name: tuple(factor * number for number in x) if isinstance(x, tuple) else factor * x
             for name, x in vars(self).items()
             if x is not None
         }
@@ -306,8 +306,8 @@ def chosen_sensors(
             if name not in WRENCH_COMPONENTS:
                 raise UnknownNameError.at_field(field_name, name, contact.component_names)
             if name not in contact.component_names:
-                found = f"'{name}', which a {contact.kind} contact cannot exert"
-                raise SensorError.at_field(field_name, found, ", ".join(contact.component_names))
+                reason = f"'{name}', which a {contact.kind} contact cannot exert"
+                raise SensorError.at_field(field_name, reason, ", ".join(contact.component_names))
             wrench[frames.index(frame), WRENCH_COMPONENTS.index(name)] = True
     return SensorSet(torque, wrench, noise or SensorNoise())
 
@@ -316,14 +316,14 @@ def _check_scalar(field_name: str, contact: Contact, names: Sequence[str]) -> No
     """Refuse components beside that of a scalar sensor, and a contact that is read along other axes."""
     others = [name for name in names if name != NORMAL_FORCE]
     if others:
-        found = f"'{others[0]}' of a contact whose force is read along the ground's normal, '{NORMAL_FORCE}'"
+        reason = f"'{others[0]}' of a contact whose force is read along the ground's normal, '{NORMAL_FORCE}'"
         accepted = f"[{NORMAL_FORCE}] alone, or components of the wrench without it"
-        raise SensorError.at_field(field_name, found, accepted)
+        raise SensorError.at_field(field_name, reason, accepted)
     if not contact.along_normal:
-        found = f"'{NORMAL_FORCE}' of a contact whose wrench is read"
+        reason = f"'{NORMAL_FORCE}' of a contact whose wrench is read"
         accepted = f"{', '.join(contact.component_names)}; {NORMAL_FORCE} if the experiment's own sensors have it too "
         accepted += "(in Python: a Contact with along_normal=True)"
-        raise SensorError.at_field(field_name, found, accepted)
+        raise SensorError.at_field(field_name, reason, accepted)
 
 
 def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:
@@ -357,6 +357,8 @@ def minimized_errors(robot: Robot, contacts: Sequence[Contact], sensors: SensorS
     if not torque.all():
         lacking = [name for name, known in zip(robot.joint_names, torque, strict=True) if not known]
         makers.append(f"torque of {join_names(lacking)}" if torque.any() else "joint torque")
-    if frames := [x.frame for x, own in zip(contacts, measured, strict=True) if own.sum() < len(x.components)]:
+    if frames := [
+        x.frame for x, components in zip(contacts, measured, strict=True) if components.sum() < len(x.components)
+    ]:
         makers.append(f"unmeasured force at {join_names(frames)}" if measured.any() else "contact force")
     return f"errors of {' and '.join(rows)}" + f" that no {' or '.join(makers)} can make" * bool(makers)

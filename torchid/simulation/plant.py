@@ -175,14 +175,14 @@ class JointConstraints:
         for name, position in self.held.items():
             _hold(spec, spec.joint(name), position)
         for name, mimic in self.mimics.items():
-            one = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=name, name2=mimic.master)
-            one.data[:5] = [mimic.offset, mimic.multiplier, 0.0, 0.0, 0.0]
+            first = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=name, name2=mimic.master)
+            first.data[:5] = [mimic.offset, mimic.multiplier, 0.0, 0.0, 0.0]
         for number, loop in enumerate(self.loops):
             for frame, site in zip(loop.frames, _sites(number), strict=True):
                 spec.body(body_name(frame)).add_site(name=site)
             kind = mujoco.mjtEq.mjEQ_CONNECT if loop.kind == "point" else mujoco.mjtEq.mjEQ_WELD
-            one, other = _sites(number)
-            spec.add_equality(type=kind, name1=one, name2=other, objtype=mujoco.mjtObj.mjOBJ_SITE)
+            first, second = _sites(number)
+            spec.add_equality(type=kind, name1=first, name2=second, objtype=mujoco.mjtObj.mjOBJ_SITE)
         for equality in spec.equalities:
             equality.solref[:] = [2.0 / physics_hz, 1.0]
             equality.solimp[:2] = _STIFFEST
@@ -485,8 +485,8 @@ def _add_armatures(model: mujoco.MjModel, path: Path, joints: Sequence[TreeJoint
     """Give joints the armatures of an MJCF file, which `plain_urdf` loses; UrdfError of springs, which it loses too."""
     for joint in joints:
         if joint.stiffness:
-            found = f"a spring of stiffness {joint.stiffness:g}"
-            raise UrdfError(path, f"joint '{joint.name}'", found, "joints without springs, for a simulation")
+            reason = f"a spring of stiffness {joint.stiffness:g}"
+            raise UrdfError(path, f"joint '{joint.name}'", reason, "joints without springs, for a simulation")
         if joint.armature:
             model.dof_armature[model.joint(joint.name).dofadr] = joint.armature
 
@@ -581,8 +581,10 @@ def _refusal(urdf: Path, spec: mujoco.MjSpec, message: str) -> UrdfError:
         held = f", or robot.weld: {{{joint}: 0}}, which holds it still" if joint else ""
         accepted = f"an <inertial> of the link{held}"
         return UrdfError(urdf, f"link '{named[1]}'", "moves without mass or without inertia", accepted)
-    found = "with what is welded to it, an inertia that no body has"
-    return UrdfError(urdf, f"link '{named[1]}'", found, "principal moments A, B, C above 0, none above the others' sum")
+    reason = "with what is welded to it, an inertia that no body has"
+    return UrdfError(
+        urdf, f"link '{named[1]}'", reason, "principal moments A, B, C above 0, none above the others' sum"
+    )
 
 
 def _carries_mass(body: mujoco.MjsBody) -> bool:

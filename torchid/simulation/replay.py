@@ -184,8 +184,8 @@ class _Simulated:
     def __init__(self, model: Model, feet: Sequence[Foot], log: ReplayedLog) -> None:
         for name, value in zip(model.joints, model.armature, strict=True):
             if value < 0.0:
-                found = f"{value:.3g} kg m^2, which MuJoCo would not take"
-                raise InputError(model.urdf.parent, f"armature of {name}", found, "estimator.name=consistent")
+                reason = f"{value:.3g} kg m^2, which MuJoCo would not take"
+                raise InputError(model.urdf.parent, f"armature of {name}", reason, "estimator.name=consistent")
         self.log = log
         self.floating = log.angular_velocity is not None
         self.feet = feet if self.floating else ()

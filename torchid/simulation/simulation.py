@@ -96,8 +96,8 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
     _, off = _tasks(plant, feet, targets, rotations)
     if not np.abs(off).max() < _TOLERANCE:
         worst = np.abs(off).max()
-        found = f"no stance near it with all feet on the floor and the base level: off by {worst:.2g} m or rad"
-        raise InputError.at_field("posture", found, "joint positions, by name, in which the robot nearly stands")
+        reason = f"no stance near it with all feet on the floor and the base level: off by {worst:.2g} m or rad"
+        raise InputError.at_field("posture", reason, "joint positions, by name, in which the robot nearly stands")
     return Stance(plant.position.copy(), plant.com.copy(), targets, rotations)
 
 
@@ -126,8 +126,8 @@ def _flattened(R: Array, foot: Foot) -> Array:
     axis = np.cross(normal, [0.0, 0.0, 1.0])
     angle = np.arctan2(np.linalg.norm(axis), normal[2])
     if angle > _STEEPEST:
-        found = f"{foot.frame} is {np.degrees(angle):.0f} degrees off the horizontal"
-        raise InputError.at_field("posture", found, f"joint positions that put it within {np.degrees(_STEEPEST):.0f}")
+        reason = f"{foot.frame} is {np.degrees(angle):.0f} degrees off the horizontal"
+        raise InputError.at_field("posture", reason, f"joint positions that put it within {np.degrees(_STEEPEST):.0f}")
     return Rotation.from_rotvec(angle * axis / max(float(np.linalg.norm(axis)), 1e-12)).as_matrix() @ R
 
 
@@ -327,9 +327,9 @@ class ReferenceMotion:
         self._moved = _with_derivatives(moved, control_hz)
         self._driven = np.array([any(wave.what == name for wave in config.waves) for name in joint_names])
         if config.steps and config.steps.swing_s + 2.0 * config.steps.transfer_s > 1.0 / config.steps.hz:
-            found = f"{config.steps.swing_s:g} in the air and twice {config.steps.transfer_s:g} to transfer the load"
+            reason = f"{config.steps.swing_s:g} in the air and twice {config.steps.transfer_s:g} to transfer the load"
             accepted = f"at most the period of {1.0 / config.steps.hz:g} s together"
-            raise InputError.at_field(f"motions.{config.name}.steps.swing_s", found, accepted)
+            raise InputError.at_field(f"motions.{config.name}.steps.swing_s", reason, accepted)
         for frame in config.steps.order if config.steps else ():
             if frame not in feet:
                 raise UnknownNameError.at_field(f"motions.{config.name}.steps.order", frame, feet)
@@ -432,8 +432,8 @@ class Simulation:
         points = [middle + foot.arms @ R.T for foot, middle, R, on in standing if on]
         if not points or not form_polygon(np.concatenate(points)):
             names = ", ".join(foot.frame for foot, on in zip(self.feet, support, strict=True) if on)
-            found = f"stands on {names} alone, whose contact points lie on a line" if names else "no foot on the floor"
-            raise InputError.at_field(field, found, "three points on the floor that do not, at any time")
+            reason = f"stands on {names} alone, whose contact points lie on a line" if names else "no foot on the floor"
+            raise InputError.at_field(field, reason, "three points on the floor that do not, at any time")
 
     def reference(self, config: MotionConfig) -> ReferenceMotion:
         """The reference of a motion: a setpoint for every control step.
@@ -572,7 +572,7 @@ class Stability:
 
     def require_within(self, bounds: BoundsConfig, motion: str) -> None:
         """Require that the robot stayed within the bounds of standing. Raises InputError: a bound is broken."""
-        for found, allowed in (
+        for measured, allowed in (
             (f"base height changes by {self.height_change:.3g} m", self.height_change <= bounds.height_m),
             (f"a foot slips by {1e3 * self.slip:.3g} mm", self.slip <= bounds.slip_m),
             (f"zero-moment point {1e3 * self.zmp_margin:.3g} mm inside the support", self.zmp_margin >= bounds.zmp_m),
@@ -581,7 +581,7 @@ class Stability:
         ):
             if not allowed:
                 accepted = "a gentler motion, another posture or wider bounds"
-                raise InputError.at_field(f"motions.{motion}", found, accepted)
+                raise InputError.at_field(f"motions.{motion}", measured, accepted)
 
 
 def _measure_stability(simulation: Simulation, recording: Recording) -> Stability:
@@ -606,9 +606,9 @@ def _measure_stability(simulation: Simulation, recording: Recording) -> Stabilit
     bearing = np.linalg.norm(force, axis=2).max(axis=0)
     for foot, most in zip(feet, bearing, strict=True):
         if most <= load:
-            found = f"{load:g} N, but {foot.frame} never bears more than {most:.3g} N"
+            reason = f"{load:g} N, but {foot.frame} never bears more than {most:.3g} N"
             accepted = "a fraction of what a standing foot bears"
-            raise InputError.at_field("sensors.contact_threshold", found, accepted)
+            raise InputError.at_field("sensors.contact_threshold", reason, accepted)
     low, high = plant.limits.T
     height = _require_field(log, "base_position_world")[:, 2]
     return Stability(
