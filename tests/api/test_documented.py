@@ -113,7 +113,7 @@ def _filled_in(part: ast.expr) -> str:
     if isinstance(part, ast.Constant):
         return str(part.value)
     assert isinstance(part, ast.FormattedValue)
-    return "URDF" if re.fullmatch(r"(\w+\.)*(robot\.format|of)", ast.unparse(part.value)) else "…"
+    return "URDF" if re.fullmatch(r"(\w+\.)*(robot\.format|form|nominal_label)", ast.unparse(part.value)) else "…"
 
 
 @pytest.mark.parametrize("message", messages())

@@ -2,8 +2,8 @@
 
 - `check` calls all in their order; `findings` are what they return
 - of signals alone: `readings`, `spikes`, `motion`; of contacts and feet that stand: `contacts`, `standing_feet`
-- of torques against a robot's dynamics: `forces`, which calls `mistakes`, `encoders`, `lags`, `scales`; what these
-  compare with: `model`
+- of forces against a robot's dynamics: `forces`, which judges the rows of `unknowns` by one fit (`equations`) and
+  tries `mistakes`
 
 Every check module has the same order: thresholds, public check functions, helpers in order of call. Thresholds are
 named MIN_ or MAX_, quantity, unit: `_SHARE` and `_RATIO` are dimensionless, `_STEPS` are median steps of the log.

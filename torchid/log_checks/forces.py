@@ -316,12 +316,12 @@ def _without(bodies: Sequence[ImplausibleBody], filtered: FilteredLog) -> Filter
 
 def _contradiction(unexplained: float, model: NominalModel) -> Finding:
     """A finding about forces that no usual mistake explains."""
-    file = model.robot.format
+    form = model.robot.format
     text = (
-        f"no {file} near the given one explains {format_percent(UNMODELLED_FORCE_SHARE * unexplained)} % of the forces"
+        f"no {form} near the given one explains {format_percent(UNMODELLED_FORCE_SHARE * unexplained)} % of the forces"
     )
-    advice = f"check units, frames, the order of joints and contacts, friction, the {file}'s base link and masses, and"
-    advice += f" whether the {file} is that of this robot"
+    advice = f"check units, frames, the order of joints and contacts, friction, the {form}'s base link and masses, and"
+    advice += f" whether the {form} is that of this robot"
     if not model.contacts and not model.robot.fixed_base:
         advice = f"name under contacts what touches the ground, or holds the base in the air; or {advice}"
     return Finding("forces", SUSPICIOUS, "all", text + UNEXPLAINED, advice)
