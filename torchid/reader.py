@@ -150,7 +150,9 @@ class _Reader:
         return self._process.poll() is None
 
     def open(self, opener: Opener, path: Path) -> None:
-        times = max(1.0, path.stat().st_size / FREE_BYTES) * _factor()
+        status = path.stat()
+        size = min(status.st_size, 512 * getattr(status, "st_blocks", status.st_size))  # holes of a file count nothing
+        times = max(1.0, size / FREE_BYTES) * _factor()
         self._path = path
         self._limits = (int(times * MEMORY_BYTES), math.ceil(times * PROCESSOR_SECONDS))
         self.ask(
