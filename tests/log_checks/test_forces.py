@@ -153,6 +153,17 @@ def test_torques_that_are_a_hundredth_are_named_with_their_factor(recorded: tupl
 # ----------------------------------------------------------------------------------------- masses and inertias of files
 
 
+def test_a_torque_that_is_a_hundredth_is_named_beside_forces_that_no_model_explains() -> None:
+    log = arm().log
+    ripple = np.sin(2.0 * np.pi * 3.0 * log.time + np.arange(len(log.joint_names))[:, None]).T
+    torque = value(log.joint_torque)
+    heaviest = int(np.square(torque).mean(axis=0).argmax())
+    torque = torque + 0.3 * np.square(torque).mean(axis=0) ** 0.5 * ripple
+    torque[:, heaviest] = 0.01 * value(log.joint_torque)[:, heaviest]
+    said = [x for x in of_arm(replace(log, joint_torque=torque)).findings if x.name in ("scale", "unit")]
+    assert [x.channels for x in said] == [(log.joint_names[heaviest],)]
+
+
 def damaged(change: Callable[[float, Array, Array], tuple[float, Array, Array]], *bodies: int) -> Robot:
     """The arm with other masses, centres of mass and inertias of some bodies."""
     nominal = robot_of(ARM).nominal.copy()

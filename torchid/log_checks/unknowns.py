@@ -38,9 +38,10 @@ from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.robot.urdf import position_limits
 
-#: Unexplained forces without the unknowns over those with them, and what these may leave: more, and the forces are
-#: another robot's.
+#: Unexplained forces without the unknowns over those with them; the same where these leave more than `MAX_LEFT`, as
+#: of another robot, or where other joints have forces that no model explains.
 MIN_UNEXPLAINED_RATIO = 1.25
+MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT = 1.5
 MAX_LEFT = 1.5
 #: Kinds that leave as much as the best one, up to this ratio: the one with the fewest unknowns is named.
 _ALIKE_RATIO = 1.1
@@ -193,7 +194,9 @@ def explain(equations: ForceEquations, kind: Kind) -> Explanation | None:
     clear = estimate.certain & estimate.steady if kind.steady else estimate.certain
     named = _named(kind, which, reduced, estimate, clear, 1.0 + applied[which])
     without = equations.reduced(kind.columns[..., :0], kind.constants).left
-    if not named.any() or not without > MIN_UNEXPLAINED_RATIO * estimate.left or estimate.left > MAX_LEFT:
+    is_another = estimate.left > MAX_LEFT
+    least_ratio = MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT if is_another else MIN_UNEXPLAINED_RATIO
+    if not named.any() or not without > least_ratio * estimate.left:
         return None
     findings = kind.findings(which[named].tolist(), estimate.of(named))
     return Explanation(findings, estimate.left, len(which), estimate.value) if findings else None
