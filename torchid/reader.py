@@ -132,6 +132,7 @@ class _Reader:
         self._owner = os.getpid()
         self._path = Path()
         self._limits = (0, 0)
+        self._is_answering = False  # whether answers to a request are still to come
         command = [sys.executable, "-c", _COMMAND.format(sys.path)]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(
@@ -166,6 +167,9 @@ class _Reader:
 
     def close(self) -> None:
         """Leave the process to others, unless it has not said all that it was asked for."""
+        if self._is_answering:
+            self.end()
+            return
         try:
             self.ask({"close": True})
         except BaseException as error:
@@ -189,9 +193,11 @@ class _Reader:
         return answer
 
     def ask_for_many(self, request: dict[str, Any]) -> Iterator[Any]:
+        self._is_answering = True
         self._send(request)
         while True:
             kind, value = self._receive()
+            self._is_answering = kind in ("warning", "value", "values")
             if kind == "warning":
                 name, text = value
                 warn(text, getattr(errors, name))

@@ -54,6 +54,9 @@ MIN_COMMON_GAIN_RATIO = 1.3
 _MIN_SHORTFALL = 3.0
 #: Factor of a torque up to which its readings are corrected before it is told from 0.
 _MAX_SMALL_GAIN = 0.1
+#: Lag up to which a log is corrected by it, and share of its shortest piece.
+_MAX_LAG_S = 0.5
+_MAX_LAG_SHARE = 0.25
 #: Prior of the factor of all wrenches: of kN to N.
 _MAX_UNIT_RATIO = 1e3
 #: How far the factor of a reversed torque may be from -1, and that of a unit from it.
@@ -165,8 +168,8 @@ def best_explanation(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> Ex
     ]
     first, *more = best.findings
     also = "".join(f"; or {text}, which explains as much" for text in others)
-    gain = equations.unexplained / max(best.left, 1e-9)
-    found_text = f"{first.found}{also}: {gain:.2g} times as much is unexplained otherwise"
+    ratio = equations.unexplained / max(best.left, 1e-9)
+    found_text = f"{first.found}{also}; without this correction {ratio:.2g} times as much of the forces is unexplained"
     return replace(best, findings=[replace(first, found=found_text), *more])
 
 
@@ -308,7 +311,7 @@ def kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[str, 
 
 
 def _torque_kinds(log: Log, equations: ForceEquations) -> Iterator[Kind]:
-    """Factors, exchanges, offsets and drifts of joint torques."""
+    """Factors, exchanges, and offsets of joint torques."""
     robot = equations.model.robot
     readings = equations.builder.recorded_torque(equations.samples)[:, : robot.n].numpy()
     known = np.flatnonzero((equations.builder.sensors.torque & ~robot.is_passive)[: robot.n])
@@ -771,7 +774,8 @@ def _lag_kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[
     for clock in _clocks(filtered, derived):
 
         def moved(x: FloatArray, clock: _Clock = clock) -> tuple[ForceEquations, FloatArray] | None:
-            if np.abs(x).max() > 0.5:
+            shortest = min(float(np.ptp(piece.time)) for piece in filtered.pieces)
+            if np.abs(x).max() > min(_MAX_LAG_S, _MAX_LAG_SHARE * shortest):
                 return None
             slope = x[1] if len(x) > 1 else 0.0
             pieces = [

@@ -668,10 +668,10 @@ class _Recording:
         The base link and the child links of fixed joints are defined by the URDF, which is not read here: without an
         expected frame, the warning names the assumed frame, `otherwise`.
         """
-        reason = self.frame(role)
-        if reason and (expected is None or reason.removeprefix("/") != expected.removeprefix("/")):
+        frame = self.frame(role)
+        if frame and (expected is None or frame.removeprefix("/") != expected.removeprefix("/")):
             taken_for = otherwise if expected is None else f"'{expected}'"
-            text = f"frame '{reason}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
+            text = f"frame '{frame}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
             warn_about_file(f"{self.series[role].topic}: {text}")
 
 

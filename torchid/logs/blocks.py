@@ -166,6 +166,8 @@ def _open_arrays(container: Container, folder: Path, columns: Columns | None, ne
             if not shapes[source]:
                 require_plain(source, container.load(name))
                 raise LogError.at_field(f"'{source}'", "a single value", "an array with a row for each sample")
+            if axis >= len(shapes[source]):
+                load_part(source, given, load)  # which refuses it
             counts[source] = shapes[source][axis]
     constant = {source for field in mapped.fields for source in mapped.constant_sources(field)}
     constant = {source for source in constant if len(shapes[source]) == 1}

@@ -369,7 +369,7 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
     right.axvline(estimate.rank + 0.5, color="0.5", linewidth=0.8)
     right.set_title(f"singular values, rank {estimate.rank}", loc="left", fontsize=8)
     right.set_xlabel("number")
-    right.set_ylabel("singular value [standard deviations per scale]")
+    right.set_ylabel("singular value\n[standard deviations per scale]")
     right.grid(visible=True)
     return figure
 
