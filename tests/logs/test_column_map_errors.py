@@ -179,7 +179,7 @@ BAD_ARRAYS: list[tuple[str, dict[str, Any], str]] = [
     (ORDER + "joint_position: q", {"q": np.array([["a", "b"]] * 3)}, "'q': values of type <U1; accepted: real numbers"),
     (ORDER + "joint_position: q", {"q": np.array(1.0)}, "'q': a single value"),
     (ORDER + "joint_position: q", {"q": np.ones((2, 3))}, "'q': shape (N, 3); accepted: (N, 2), one for each name of"),
-    (ORDER + "joint_position: q.T", {"q": np.ones((2, 3, 1))}, "'q.T': an array of shape (N, 3, 1); accepted: one of"),
+    (ORDER + "joint_position: q.T", {"q": np.ones((2, 3, 1))}, "'q.T': a 3-dimensional array; accepted: one of"),
     (ORDER + "joint_position: p.T", {}, "logs.columns.joint_position: 'p.T', no such column; accepted: "),
     (ORDER + "joint_position: \"q['a']\"", {}, "'q['a']': an array of shape (N, 2); accepted: an array of records"),
     (

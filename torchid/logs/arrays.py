@@ -75,7 +75,7 @@ def _part_of(array: AnyArray, part: re.Match[str]) -> AnyArray:
         raise LogError.at_field(f"'{part[0]}'", "no such field" if fields else by_samples, accepted)
     if part["first"] is None:
         if array.ndim != 2:
-            raise LogError.at_field(f"'{part[0]}'", by_samples, "one of rows and columns")
+            raise LogError.at_field(f"'{part[0]}'", f"a {array.ndim}-dimensional array", "one of rows and columns")
         return array.T
     width = array.shape[1] if array.ndim > 1 else 0
     start = int(part["first"] or 0)
