@@ -315,7 +315,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         from torchid.terminal.identification import evaluation_lines, evaluation_parts
 
     evaluated = evaluate(options.run, options.log, options.device, True, options.output, options.overwrite)
-    _show(options, partial(evaluation_lines, evaluated), partial(evaluation_parts, evaluated))
+    _show(options, partial(evaluation_lines, evaluated), lambda _: evaluation_parts(evaluated))
 
 
 def _replay(options: argparse.Namespace) -> None:

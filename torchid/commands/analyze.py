@@ -430,7 +430,7 @@ def _chosen_along_normals(choice: SensorPlan, contacts: Sequence[Contact]) -> tu
 def _is_chosen(choice: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact]) -> bool:
     """Whether a set, read along the axes of these contacts, is the chosen one; what none can exert does not count."""
     chosen = sensor_set(choice.problem.robot, contacts, choice.chosen)
-    wrench, other = (measured_components(contacts, read) for read in (chosen, sensors))
+    wrench, other = (measured_components(contacts, x) for x in (chosen, sensors))
     same = np.array_equal(chosen.torque, sensors.torque) and np.array_equal(wrench, other)
     return same and not _chosen_along_normals(choice, contacts)
 

@@ -118,8 +118,15 @@ def check_experiment(
             setup_of_file = setup_of_log(setup, file)
             _require_memory(file, settings)
             log, _ = apply_contact_settings(recorded_log(file, config.logs, settings), setup_of_file)
-            settings_of_check = setup.contacts, settings.filter_hz, settings.derived, setup.declared, required
-            found = check(log, setup_of_file.robot, *settings_of_check)
+            found = check(
+                log,
+                setup_of_file.robot,
+                setup.contacts,
+                settings.filter_hz,
+                settings.derived,
+                setup.declared,
+                required,
+            )
             checked.append(replace(found, rolling=setup.rolling))
     return checked
 

@@ -61,9 +61,8 @@ MARGINS = (None, 0.03, 0.06)
 MOST_TRIED = 20_000
 """Samples of a log that settings are chosen with."""
 
-# of cutoffs that are tried, and the lowest: nobody moves slower to be identified
-_OCTAVES = 8
-_LOWEST_HZ = 2.5
+_OCTAVES = 8  # of cutoffs that are tried
+_LOWEST_HZ = 2.5  # of these: nobody moves slower to be identified
 _PERIODS = 12.0 * DROPPED_PERIODS  # of a cutoff in the shortest log, at least: of a fourth held back a third is left
 
 

@@ -202,9 +202,9 @@ def _write_all(
     rounds: Iterable[list[tuple[str, FactorFile] | None]] = ([factor_file] for factor_file in factors)
     if distributed.world_size() > 1:
         with distributed.apart():
-            written = list(factors)
-        most = max(distributed.all_gather(len(written), "numbers of files"))
-        rounds = (distributed.all_gather(written[k] if k < len(written) else None, "files") for k in range(most))
+            of_process = list(factors)
+        most = max(distributed.all_gather(len(of_process), "numbers of files"))
+        rounds = (distributed.all_gather(of_process[k] if k < len(of_process) else None, "files") for k in range(most))
     files = {}
     writing = new_folder(output, overwrite, COMPRESSED) if distributed.is_first() else nullcontext()
     with during("writing", output), writing as folder:

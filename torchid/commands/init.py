@@ -364,13 +364,13 @@ def _text(
 ) -> str:
     """The experiment file, with comments."""
     from_feet = _from_feet(robot, contacts, fields)
-    sections: dict[str, object] = {"mjcf" if is_mjcf(Path(urdf)) else "urdf": _relative(Path(urdf), output)}
-    sections |= {"fixed_base": True} if robot.fixed_base or _is_fixed(contacts, fields) else {}
-    sections |= {"weld": weld} if (weld := welded_at(robot, held_joints(robot, proposal.lacking))) else {}
+    robot_keys: dict[str, object] = {"mjcf" if is_mjcf(Path(urdf)) else "urdf": _relative(Path(urdf), output)}
+    robot_keys |= {"fixed_base": True} if robot.fixed_base or _is_fixed(contacts, fields) else {}
+    robot_keys |= {"weld": weld} if (weld := welded_at(robot, held_joints(robot, proposal.lacking))) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
     to_fill_in = f", fill in {FILL_IN}" * (FILL_IN in str(proposal.columns))
     lines = [f"# {names}, by torchid init; check what is assumed{to_fill_in}"]
-    lines += yaml_lines("robot", sections)
+    lines += yaml_lines("robot", robot_keys)
     lines += [f"  # assumed: weld: {_WELDED}"] * bool(weld)
     if contacts:
         lines.append("contacts:  # assumed: from names of links")

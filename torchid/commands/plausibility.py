@@ -13,7 +13,7 @@ from rich.progress import Progress, TaskID
 from torchid import parameters
 from torchid.commands.check import LogSegment, segments_to_check
 from torchid.commands.chosen_settings import is_near_nominal, lower_cutoff, needs_these_torques
-from torchid.commands.run_folder import Identification
+from torchid.commands.results import Results
 from torchid.config import ExperimentConfig
 from torchid.config.logs import LogsConfig
 from torchid.errors import (
@@ -251,7 +251,7 @@ def require_not_worse(worse: list[WorseThanNominal], fitted: Metrics, sensors: S
         warn_about_file(f"{message}{logs.doubt(message, refused=False) or f'; {ADVICE}'}", NumericalWarning)
 
 
-def suspected_mistake(run: Identification, logs: TrainingLogs) -> str:
+def suspected_mistake(run: Results, logs: TrainingLogs) -> str:
     """What the checks find in the training logs where a fit is doubtful, in words; "" where it is not, or they do not.
 
     A fit is doubtful if its bodies are far off the robot's file, or if it leaves a large part of a joint's torque:

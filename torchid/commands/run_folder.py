@@ -74,7 +74,10 @@ _WRITTEN = "a folder that this version of torchid identify wrote"
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Identification(Results):
-    """A finished run; `run["l_knee"]` is what it says of a body, by its name or that of its joint."""
+    """A finished run; `run["l_knee"]` is what it says of a body, by its name or that of its joint.
+
+    Its attributes are those of `torchid.commands.results.Results`.
+    """
 
     def __repr__(self) -> str:
         return "\n".join(summary_lines(self))
@@ -112,7 +115,7 @@ class Identification(Results):
 
 
 def write_run(
-    run: Identification,
+    run: Results,
     output: Path,
     overwrite: bool = False,
     training: Training | None = None,
@@ -150,7 +153,7 @@ def write_run(
         training.remove_checkpoint()
 
 
-def _metrics_document(run: Identification) -> dict[str, object]:
+def _metrics_document(run: Results) -> dict[str, object]:
     """What `metrics.json` holds: errors of the identified and of the nominal parameters."""
     estimate = run.estimate
     robot = run.experiment.robot
@@ -228,7 +231,7 @@ def _factor_entry(factors: FactorFile) -> dict[str, object]:
     return names | {"samples": log.samples, "duration_s": factors.duration}
 
 
-def _identifiability_document(run: Identification) -> dict[str, object]:
+def _identifiability_document(run: Results) -> dict[str, object]:
     """What the data determine, and what each log and sensor adds; contact states have a list of their own."""
     estimate = run.estimate
     contributions = run.contributions

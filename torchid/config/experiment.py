@@ -126,8 +126,8 @@ class ActuatorsConfig:
     @staticmethod
     def without_terms() -> dict[str, Any]:
         """What each key is without its term."""
-        fields = dataclasses.fields(ActuatorsConfig)
-        return {field.name: False if field.type == "BoolOrAuto" else None for field in fields}
+        numbers = ("stribeck", "sign_width", "delay")
+        return {field.name: None if field.name in numbers else False for field in dataclasses.fields(ActuatorsConfig)}
 
 
 @dataclass(config=STRICT, frozen=True)

@@ -210,7 +210,7 @@ def term_violations(problem: LinearProblem, phi: Array, psi: Array | None, toler
 def _bound_violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float) -> list[Violation]:
     """Parameters outside their bounds."""
     out = []
-    (lower, upper) = conditions.bounds(len(phi))
+    lower, upper = conditions.bounds(len(phi))
     beyond = np.maximum(lower - phi, phi - upper)
     for body, number in zip(*np.nonzero(beyond > tolerance * scale), strict=True):
         name = parameters.PARAMETERS[number]

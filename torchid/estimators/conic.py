@@ -418,7 +418,7 @@ def _inequalities(x: _Scaled, problem: LinearProblem, conditions: Conditions) ->
     """Bounds of the free parameters, except coinciding ones, which are equalities, and conditions on terms."""
     out = list[LinearCondition]()
     terms = problem.terms
-    (lower, upper) = conditions.bounds(len(x.free))
+    lower, upper = conditions.bounds(len(x.free))
     differ = upper - lower > EQUAL_WITHIN * x.scale
     for bound, sign, word in ((lower, 1.0, "lower"), (upper, -1.0, "upper")):
         for body, number in zip(*np.nonzero(np.isfinite(bound) & x.free & differ), strict=True):
@@ -436,7 +436,7 @@ def _equalities(x: _Scaled, conditions: Conditions) -> list[LinearCondition]:
     """Total mass, mirror images and bounds that coincide."""
     out = list[LinearCondition]()
     scale = x.scale
-    (lower, upper) = conditions.bounds(len(x.free))
+    lower, upper = conditions.bounds(len(x.free))
     if conditions.total_mass is not None:
         masses = scale[:, parameters.MASS] / conditions.total_mass
         weights = {(body, parameters.MASS): float(mass) for body, mass in enumerate(masses)}

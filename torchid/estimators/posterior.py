@@ -63,21 +63,21 @@ class Posterior:
         Raises:
             InputError: the conditions exclude each other.
         """
-        bodies = len(self.nominal)
+        count = len(self.nominal)
         extras = len(self.extra_size)
         never_negative = np.eye(extras)[np.isfinite(self.extra_lower)]
         terms = EliminatedTerms(  # the prior of the extra parameters is further rows
-            C=np.concatenate([self.A, np.zeros((extras, bodies))]),
+            C=np.concatenate([self.A, np.zeros((extras, count))]),
             D=np.concatenate([self.D, np.diag(1.0 / self.extra_size)]),
             z=np.append(self.b, np.zeros(extras)),
             size=self.extra_size,
             labels=("an extra parameter",) * extras,
             conditions=tuple(
-                SignCondition("an extra parameter", unit, np.zeros(bodies), float(unit @ self.extra_size), "")
+                SignCondition("an extra parameter", unit, np.zeros(count), float(unit @ self.extra_size), "")
                 for unit in never_negative
             ),
         )
-        no_rows = np.zeros((0, bodies))
+        no_rows = np.zeros((0, count))
         problem = LinearProblem(no_rows, np.zeros(0), 0.0, 1, self.nominal, self.scale, self.free, terms=terms)
         conic = build_conic_problem(problem, self.conditions, prior_error**-2, "pullback", self._metric())
         size = len(conic.linear)

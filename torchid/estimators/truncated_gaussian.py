@@ -236,8 +236,8 @@ class EllipticalSlice(torch.nn.Module):
         self._groups = 0
         for moving in (np.arange(len(owners)), *_pairs(gaussian, owners)):
             self._add_group(gaussian, E, moving)
-        self.moved = 1
-        self.passes = 1  # groups that move in a pass, the first one all variables together
+        self.moved = 1  # groups that move in a pass, the first one all variables together
+        self.passes = 1
         self._measure()
 
     def _add_group(self, gaussian: BarrierGaussian, E: Array, variables: np.ndarray) -> None:

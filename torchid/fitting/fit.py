@@ -207,18 +207,18 @@ class LogFitter:
         Rows are weighted with the noise of forces, which is that of readings times their scales.
         """
         fit = self.solve_problem(problem, self.least_squares.solve)
-        variance = 0.0
+        of_motion = 0.0
         no_readings = dict.fromkeys(scale_columns(self.builder), 0.0)
         for log in {part.source: None for part in problem.parts}:
             at = np.append(fit.columns(self.builder, log).cpu().double().numpy(), -1.0)
             for part in problem.parts:
                 if part.source == log:
-                    variance += float(at @ part.factor.whole_noise_gram(no_readings).numpy() @ at)
-        variance = max(fit.estimate.residual_std**2 - variance / max(fit.assembly.problem.rows, 1), 0.0)
+                    of_motion += float(at @ part.factor.whole_noise_gram(no_readings).numpy() @ at)
+        variance = max(fit.estimate.residual_std**2 - of_motion / max(fit.assembly.problem.rows, 1), 0.0)
         values = {x.extra.label: 1.0 + x.value for x in fit.extras}
         of_column = zip(no_readings, (x.label for x in self.builder.extras if x.what == "scale"), strict=True)
-        noise = ((column, abs(values.get(label, 1.0))) for column, label in of_column)  # 1 where no row depends on it
-        return {column: variance / max(scale, _LEAST_SCALE) ** 2 for column, scale in noise}
+        scales = ((column, abs(values.get(label, 1.0))) for column, label in of_column)  # 1 where no row depends on it
+        return {column: variance / max(scale, _LEAST_SCALE) ** 2 for column, scale in scales}
 
     def solve_problem(self, problem: LogProblem, solve: Solve | None = None) -> Fit:
         """Solve what `build_problem` has built; `solve` instead of the estimator's."""

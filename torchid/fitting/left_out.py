@@ -163,10 +163,6 @@ class Reading:
         grams[:, at[:, None], at] = self.grams
         return replace(other, grams=grams, rows=self.rows)
 
-    def unexplained(self, terms: Collection[str]) -> float:
-        """What a fit leaves of the forces of left-out blocks (rms over rms)."""
-        return math.sqrt(float(self.left_out(terms).sum()) / max(float(self.grams[:, -1, -1].sum()), 1e-300))
-
 
 @one_thread()
 def gain_deviations(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms, gain: float) -> Array:
@@ -241,10 +237,10 @@ def compress_reading(
     return Reading(grams, rows, oversampling, nominal[shared_columns], spread[shared_columns], shared, gain)
 
 
-def _eliminated(gram: Array, kept: Sequence[int], unknown: Sequence[int]) -> Array:
+def _eliminated(gram: Array, unknown: Sequence[int], kept: Sequence[int]) -> Array:
     """What is left of a Gram matrix where unknowns of its log alone are at their best."""
-    across = gram[np.ix_(kept, unknown)]
-    return np.asarray(gram[np.ix_(unknown, unknown)] - across.T @ np.linalg.pinv(gram[np.ix_(kept, kept)]) @ across)
+    across = gram[np.ix_(unknown, kept)]
+    return np.asarray(gram[np.ix_(kept, kept)] - across.T @ np.linalg.pinv(gram[np.ix_(unknown, unknown)]) @ across)
 
 
 def thinned(logs: Sequence[Samples], count: int = SAMPLES) -> list[Samples]:
@@ -252,11 +248,11 @@ def thinned(logs: Sequence[Samples], count: int = SAMPLES) -> list[Samples]:
     step = max(1, sum(map(len, logs)) // count)
     out = []
     for log in logs:
-        without: dict[str, object] = {"folder": None, "motion_noise": None, "unloaded": None}
+        changes: dict[str, object] = {"folder": None, "motion_noise": None, "unloaded": None}
         if log.torque is not None and len(log) > 1:
             rate = np.gradient(log.torque.numpy(), log.time.numpy(), axis=0)[:, : log.joint_velocity.shape[1]]
-            without["slope"] = torch.from_numpy(rate)
-        thin = replace(log, **without).every(step)  # type: ignore[arg-type]
+            changes["slope"] = torch.from_numpy(rate)
+        thin = replace(log, **changes).every(step)  # type: ignore[arg-type]
         out.append(replace(thin, oversampling=max(1.0, log.oversampling / step)))
     return out
 
@@ -366,9 +362,9 @@ class TermsChoice:
     rejected: Mapping[str, Evidence]
 
     def __str__(self) -> str:
-        near = {name: gain for name, gain in self.rejected.items() if gain.certain and gain.gain > 0.0}
+        near = {name: x for name, x in self.rejected.items() if x.certain and x.gain > 0.0}
         named, misses = (
-            ", ".join(f"{in_words(name)} {gain}" for name, gain in x.items()) for x in (self.adopted, near)
+            ", ".join(f"{in_words(name)} {evidence}" for name, evidence in x.items()) for x in (self.adopted, near)
         )
         suffix = " (error on left-out blocks)" * bool(named or misses)
         return (named or "none") + (f"; near misses: {misses}" if misses else "") + suffix

@@ -410,7 +410,7 @@ def choose_sign_width(read: Callable[[float | None], Reading], kinds: Sequence[s
 
     tried = (None, *_WIDTHS)
     errors_of = dict(zip(tried, share_between_forks(tried, errors, thread_count()), strict=True))
-    residual = {width: evidence for width, (evidence, _) in errors_of.items()}
+    residual = {width: std for width, (std, _) in errors_of.items()}
     best = min(residual, key=lambda width: residual[width])
     width = next(x for x in tried if not Evidence.of(errors_of[x][1], errors_of[best][1]).certain)
     if width == best and width is not None:  # no other does as well

@@ -129,7 +129,10 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Findings about a mistake, what the forces leave unexplained without it, and its `count` of unknowns, (count,)."""
+    """Findings about a mistake, and what the forces leave unexplained without it.
+
+    `value`: (count,), of its `count` unknowns.
+    """
 
     findings: Sequence[Finding]
     left: float
@@ -438,26 +441,34 @@ def _common_gain(gain: float, spread: float, robot: Robot) -> Finding:
 
 
 def _single_gains(names: Sequence[str], gain: FloatArray, spread: FloatArray, robot: Robot) -> list[Finding]:
-    scaled = [name for name, x in zip(names, gain, strict=True) if not _is_reverse(np.array(x - 1.0))]
+    units = dict[str, tuple[str, str]]()
+    for name, x in zip(names, gain, strict=True):
+        expected = "N" if name in robot.sliding else "N m"
+        near = [
+            k for k, f in (("m", 1e-3), ("k", 1e3)) if abs(np.log(max(x / f, 1e-9))) < np.log(_FACTOR_TOLERANCE_RATIO)
+        ]
+        units |= {name: (near[0] + expected, expected)} if near else {}
+    of_unknown_scale = [
+        name for name, x in zip(names, gain, strict=True) if name not in units and not _is_reverse(np.array(x - 1.0))
+    ]
     out = []
     for name, x, std in zip(names, gain, spread, strict=True):
         text = f"the factor that fits the {robot.format} best is {x:.3g} +- {std:.2g}"
-        units = {"mN m": 1e-3, "kN m": 1e3}
-        unit = [u for u, f in units.items() if abs(np.log(max(x / f, 1e-9))) < np.log(_FACTOR_TOLERANCE_RATIO)]
         if _is_reverse(np.array(x - 1.0)):
             hangs = "; or robot.base_tilt, if the base is not upright" if robot.fixed_base else ""
             kind = "sign"
             severity = REJECTED
             text = f"reversed; {text}"
             advice = f"reverse these torques{hangs}"
-        elif unit:
+        elif name in units:
+            given, expected = units[name]
             kind = "unit"
             severity = REJECTED
-            text = f"in {unit[0]}; {text}"
-            advice = "give torques in N m"
+            text = f"in {given}; {text}"
+            advice = f"give {'forces' if expected == 'N' else 'torques'} in {expected}"
         else:
             advice = f"check gear ratios, torque constants and units, and the {robot.format}'s friction and inertias"
-            advice += f" there, or set sensors.scales: {{joint_torque: [[{', '.join(scaled)}]]}}"
+            advice += f" there, or set sensors.scales: {{joint_torque: [[{', '.join(of_unknown_scale)}]]}}"
             kind = "scale"
             severity = SUSPICIOUS
         out.append(Finding(kind, severity, "joint_torque", f"{name}: {text}", advice, (name,)))

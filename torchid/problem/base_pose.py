@@ -33,8 +33,8 @@ _HEADING_TOLERANCE = 0.02  # of a recorded normal's components against the state
 _HALF_FOOT_M = 0.05  # a flat foot counts as the corners of a square, a line as two points, so far from its origin
 _MIN_BREADTH = 0.05  # over the length of the feet that stand; below, noise of one tilts the base 20 times more
 _ALONG = 0.8  # cosine of the angle between an axis of a flat foot's frame and the way up to the base: 37 degrees
-_PASSES = 50
-_SETTLED_M = 1e-13  # of feet that roll; each leaves some hundredth of the error before
+_PASSES = 50  # at most; of feet that roll each leaves some hundredth of the error before
+_SETTLED_M = 1e-13
 
 
 @dataclass(frozen=True)

@@ -30,13 +30,13 @@ ProgressCallback = Callable[[int], None]
 CHUNK = 4096
 """Samples per chunk: fewer lose to dispatch, and to workers' waits for Python's lock; more to memory traffic."""
 
-_LEAST = 2048
-_EACH = 4  # samples per chunk where there are fewer chunks than so many for each worker
+_LEAST = 2048  # samples per chunk where there are fewer than `_EACH` chunks for each worker
+_EACH = 4
 _LET_GO = 4  # chunks of a worker, after which pages that samples are mapped to leave the memory of the process
 _WORTH_LOADING = 200_000  # samples of a pass: kernels take 0.4 s to load and save 2.6 to 6 us of each on two cores
 _MOST_ON_GPU = 64 * CHUNK  # samples per chunk: launching the work on one takes the host 12 ms, whatever its size
-_SHARE_OF_GPU = 8
-_ON_GPU = 48 * 2**10  # a chunk takes one of so many parts of a GPU's memory; bytes of a sample
+_SHARE_OF_GPU = 8  # a chunk takes one of so many parts of a GPU's memory
+_ON_GPU = 48 * 2**10  # bytes of a sample
 
 
 def map_chunks(

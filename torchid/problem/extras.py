@@ -98,11 +98,15 @@ def _stribeck_column(samples: Samples, tree: KinematicTree, dof: int) -> Tensor:
 
 
 ACTUATORS = {
-    "armature": ActuatorTerm("kg m^2", 0.1, "armature", lambda x, _, dof: x.joint_acceleration[:, dof], True),
+    "armature": ActuatorTerm(
+        "kg m^2", 0.1, "armature", lambda x, _, dof: x.joint_acceleration[:, dof], nonnegative=True
+    ),
     "torque_offset": ActuatorTerm("N m", 5.0, "torque offset", lambda x, *_: torch.ones_like(x.time), needs_motor=True),
     "asymmetric_coulomb": ActuatorTerm("N m", 1.0, "asymmetric Coulomb friction", _asymmetry_column),
     "stribeck": ActuatorTerm("N m", 1.0, "Stribeck friction", _stribeck_column, nonnegative=True),
-    "stiffness": ActuatorTerm("N m/rad", 1.0, "stiffness", lambda x, _, dof: x.joint_position[:, dof], True),
+    "stiffness": ActuatorTerm(
+        "N m/rad", 1.0, "stiffness", lambda x, _, dof: x.joint_position[:, dof], nonnegative=True
+    ),
 }
 """Terms of actuators, each with a field of its name in `ExtraTerms` and in the settings `actuators`.
 
@@ -315,10 +319,10 @@ def dof_extra_column(extra: Extra, dof: int, samples: Samples, tree: KinematicTr
     if extra.what == "scale":
         reading = samples.torque
         return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, dof]
-    if extra.what == "offset" or (extra.what == SLOPE and samples.slope is None):
-        return torch.ones_like(samples.time)
     if extra.what == SLOPE and samples.slope is not None:
         return samples.slope[:, dof]
+    if extra.what in ("offset", SLOPE):
+        return torch.ones_like(samples.time)
     return ACTUATORS[extra.what].column(samples, tree, dof)
 
 

@@ -361,7 +361,7 @@ class TriangularFactor:
         return replace(self, blocks=blocks, noise_gram=noise_gram)
 
     def to_cpu(self) -> TriangularFactor:
-        """The factor on the CPU, which factorizes as few rows as factors have in less time than a GPU."""
+        """The factor on the CPU, in float64: a CPU factorizes as few rows as factors have in less time than a GPU."""
         blocks = {support: block.to("cpu", torch.float64) for support, block in self.blocks.items()}
         noise_gram = {support: x.to("cpu", torch.float64) for support, x in self.noise_gram.items()}
         return replace(self, blocks=blocks, noise_gram=noise_gram)
@@ -373,10 +373,9 @@ class TriangularFactor:
         if numbers <= (self.columns + 1) * (self.columns + 2) // 2:
             return self.to_cpu()
         every = tuple(range(self.columns))
-        noise_gram = dict(self.noise_gram)
-        for support in self.noise_gram:
-            if len(support) != 1:
-                del noise_gram[support]
+        noise_gram: dict[tuple[int, ...], Tensor] = {
+            support: x for support, x in self.noise_gram.items() if len(support) == 1
+        }
         if len(noise_gram) < len(self.noise_gram):
             noise_gram[every] = self.whole_noise_gram(dict.fromkeys(every, 0.0))
         return replace(self, blocks={every: self.triangle().triu()}, noise_gram=noise_gram)

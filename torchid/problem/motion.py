@@ -106,7 +106,7 @@ def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
     index = up.abs().argmax(dim=1, keepdim=True)
     nearest = torch.zeros_like(up).scatter(1, index, up.gather(1, index).sign())
     v = torch.linalg.cross(nearest, up)
-    (x, y, z) = v.unbind(1)
+    x, y, z = v.unbind(1)
     cosine = (nearest * up).sum(1)
     diagonal = cosine[:, None, None] * torch.eye(3, dtype=up.dtype, device=up.device)
     zero = torch.zeros_like(x)

@@ -39,9 +39,9 @@ from torchid.problem.samples import Samples
 from torchid.rounding import MAD_PER_STD, RANK_TOLERANCE, is_significant
 from torchid.sensing.sensors import measured_components
 
-_SAMPLES = 1000
-_BYTES = 2**27
-_CHUNK = 256  # rows in memory: 1000 samples give a standard deviation to 2 to 3 %
+_SAMPLES = 1000  # give a standard deviation to 2 to 3 %
+_BYTES = 2**27  # of rows in memory
+_CHUNK = 256  # samples
 CLIP = 3.0
 """Robust standard deviations at which residuals, of impacts for instance, are clipped."""
 
@@ -257,8 +257,8 @@ def _random_chunks(
             yield chosen[where], state
 
 
-_LEAST = 1e-4
-_MOST = 1e3  # variance of the logarithms: deviations are 0.5 % apart, or anything
+_LEAST = 1e-4  # variance of the logarithms: deviations are 0.5 % apart
+_MOST = 1e3  # the same: deviations may be anything
 _POINTS = 41
 _HELD_OTHERS = 1e-6  # share of the information on other variances that is added to it: some may have none
 
@@ -322,8 +322,8 @@ _SMALLEST = 1e-3
 _LEFT = 0.1  # least share of the residual's degrees of freedom that a group is assigned
 _FEW = 20.0  # least number of independent readings: a standard deviation to 16 %
 _NEGLIGIBLE = 1e-9  # share of a source's variance in the rows below which it is projected out
-_STEADY = 0.01
-_STEPS = 40  # relative change of the noise along the directions of any group; most steps
+_STEADY = 0.01  # relative change of the noise along the directions of any group
+_STEPS = 40  # at most
 _CONFOUNDED = 0.5  # relative standard error of a standard deviation
 _POOLED = 0.5  # share of the prior in what determines a variance
 

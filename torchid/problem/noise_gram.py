@@ -39,8 +39,8 @@ combination. Less is taken off, and the nominal parameters make up for what is t
 """
 
 _MOST_SIGNAL = 2.0  # beyond, it is rounding, of combinations that the rows hardly determine
-_LEAST_PERTURBED = 5000
-_MOST_PERTURBED = 20_000  # samples of all logs, evenly spread, see `_perturbed`
+_LEAST_PERTURBED = 5000  # samples of all logs, evenly spread, see `_perturbed`
+_MOST_PERTURBED = 20_000  # likewise
 _NEGLIGIBLE = 1e-5  # share of noise in any combination: far below all standard errors
 _COPIES = 3  # of each sample, see `_copies`
 _RESOLVED = 1e-5  # least singular value, of columns of unit size, along which a difference of squares is no rounding

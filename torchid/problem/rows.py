@@ -213,6 +213,7 @@ class RowBuilder(nn.Module):
     task_weights: Tensor | None
     frame_rotation: Tensor
     frame_origin: Tensor
+    frame_wrenches: Tensor
     normals: Tensor
 
     def __init__(
@@ -246,6 +247,8 @@ class RowBuilder(nn.Module):
         weights = sensors.task_weights
         self.register_buffer("frame_rotation", torch.from_numpy(poses[:, :3, :3].copy()), persistent=False)
         self.register_buffer("frame_origin", torch.from_numpy(poses[:, :3, 3].copy()), persistent=False)
+        wrenches = np.array([wrench_transform(T).T for T in poses]).reshape(-1, 6, 6)
+        self.register_buffer("frame_wrenches", torch.from_numpy(wrenches), persistent=False)
         self.register_buffer("normals", torch.from_numpy(normals), persistent=False)
         self.register_buffer("task_weights", None if weights is None else torch.from_numpy(weights), persistent=False)
         self.workspaces = Workspaces()
@@ -325,17 +328,20 @@ class RowBuilder(nn.Module):
 
         `std`: (6,), what to have of each component in place of a unit.
         """
-        body, T_joint_frame = self.frames[contact]
-        std = np.ones(6) if std is None else std
+        body = self.frames[contact][0]
         arms = chunk.arms.get(contact)
         axes = chunk.ground_axes.get(contact)
         in_frame = [k for k in components if axes is None or k >= 3]
-        units = chunk.screw_axes.new_tensor((wrench_transform(T_joint_frame) * std).T[in_frame])
+        units = self.frame_wrenches[contact][self.tree.index(in_frame)]
+        if std is not None:
+            units = units * units.new_tensor(std[in_frame])[:, None]
         wrenches = wrenches_at_base(chunk.states, body, units, arms)
         if axes is None:
             return wrenches
         along = [k for k in components if k < 3]
-        forces = axes[:, along] * axes.new_tensor(std[along])[:, None]
+        forces = axes[:, self.tree.index(along)]
+        if std is not None:
+            forces = forces * axes.new_tensor(std[along])[:, None]
         at_point = forces_at_base(chunk.states, body, self.frame_origin[contact], forces, arms)
         return torch.cat([at_point, wrenches], dim=1)
 
@@ -503,7 +509,9 @@ class RowBuilder(nn.Module):
         forces = self.coupled_forces(chunk.samples, layout)
         if not layout.measured:
             return forces
-        wrenches = {contact: self.recorded_wrench(chunk, contact) for contact, _ in layout.measured}
+        wrenches = {
+            contact: self.recorded_wrench(chunk, contact) for contact in {contact for contact, _ in layout.measured}
+        }
         measured = torch.stack([wrenches[contact][:, k] for contact, k in layout.measured], dim=1)
         return forces + (rows.measured.permute(2, 1, 0) @ measured[..., None])[..., 0]
 

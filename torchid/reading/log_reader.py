@@ -381,7 +381,7 @@ def check_read(logs: Mapping[str, Sequence[Samples]]) -> None:
     spans = {split_range(log.source): log.time[[0, -1]].tolist() for of_key in logs.values() for log in of_key}
 
     def share(part: LogPart, other: LogPart) -> bool:
-        (start, stop) = spans[part]
+        start, stop = spans[part]
         (of_other, until) = spans[other]
         return part.shares_samples(other) is None and start <= until and of_other <= stop
 

@@ -161,9 +161,8 @@ def _unit_wrenches(states: BodyStates, columns: Sequence[int]) -> tuple[list[_Ve
         for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
     )
     cyclic = torch.cat([omega, omega[:2]])
-    # ..., (yz, zx, xy)
     squares = cyclic * cyclic
-    products = cyclic[1:4] * cyclic[2:]
+    products = cyclic[1:4] * cyclic[2:]  # yz, zx, xy
     yz, xz, xy = products.unbind()
     less_yz, less_xz, less_xy = products.neg().unbind()
     ax, ay, az = alpha.unbind()

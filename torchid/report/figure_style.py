@@ -21,11 +21,10 @@ from torchid.errors import during, escape
 from torchid.parallel import share_between_forks, thread_count
 
 # the palette of Okabe and Ito, which the colour-blind tell apart
-MEASURED_COLOR = "#111111"
-NOMINAL_COLOR = "#d55e00"
-IDENTIFIED_COLOR = "#0072b2"
+MEASURED_COLOR = "#111111"  # of measured forces
+NOMINAL_COLOR = "#d55e00"  # of the URDF's parameters, and what they predict
+IDENTIFIED_COLOR = "#0072b2"  # of identified parameters, and what they predict
 NOISE_COLOR = "#8c8c8c"
-"""Of measured forces, of the URDF's and of identified parameters and what they predict, and of noise."""
 
 CATEGORY_COLORS = ("#56b4e9", "#f0e442", "#009e73", "#cc79a7", "#e69f00", NOISE_COLOR, IDENTIFIED_COLOR, NOMINAL_COLOR)
 """Of things that have no order; then again from the first."""

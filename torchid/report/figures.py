@@ -495,7 +495,7 @@ def _draw_joint(
     weld = [k for k in WRENCH_COMPONENTS if f"{name}.{k}" in readings] if joint.kind == "fixed" else []
     loaded = name in constrained
     measured = bool(weld) or name in readings
-    (x, y) = position
+    x, y = position
     bend = parent[1] + 0.5
     style: dict[str, Any] = {"color": _LOADED if loaded else _PLAIN, "linewidth": 2.2 if loaded else 1.4, "zorder": 0}
     axes.plot([parent[0], parent[0], x, x], [parent[1], bend, bend, y], **style)

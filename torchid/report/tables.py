@@ -82,7 +82,6 @@ def make_table(
     headings: Sequence[str],
     rows: Iterable[Sequence[str] | None],
     left: Collection[str] = (),
-    style: box.Box = box.HEAVY_HEAD,
 ) -> Table:
     """A table of texts.
 
@@ -91,9 +90,8 @@ def make_table(
         headings: of the columns.
         rows: as many texts each as there are headings, or fewer; None is a line between them.
         left: headings of columns that are not aligned to the right, beside the first.
-        style: of the borders.
     """
-    table = Table(title=title, title_justify="left", box=style)
+    table = Table(title=title, title_justify="left")
     for number, heading in enumerate(headings):
         is_left = number == 0 or heading in left
         table.add_column(Text(heading), justify="left" if is_left else "right", overflow="fold")
@@ -106,7 +104,7 @@ def make_table(
 
 
 def error_tables(columns: Mapping[str, Comparison[Metrics]], nominal_label: str) -> list[Table]:
-    """Errors of predicted forces, nominal (`of` a URDF or MJCF) against identified, two sets of logs to a table."""
+    """Errors of predicted forces, nominal (of a URDF or MJCF) against identified, two sets to a table."""
     sets = list(columns.items())
     return [_error_table(dict(sets[i : i + 2]), nominal_label) for i in range(0, len(sets), 2)]
 
@@ -417,7 +415,7 @@ def rows_within(
 def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width: int, nominal_label: str) -> list[str]:
     """A small table of the errors of an `ErrorComparison`, not wider than so many columns; none without errors.
 
-    `of`: what the nominal parameters are those of.
+    `nominal_label`: what the nominal parameters are those of.
     """
     columns = [
         (nominal_label, [f"{before:.4g}" for _, before, _, _ in errors]),

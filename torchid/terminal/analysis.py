@@ -251,10 +251,10 @@ def check_lines(checked: Sequence[Checked], written: Sequence[str | None], width
     files = [written_line(name) for name in written if name]
     room = LINES - len([*head, *rolling, *skipped, *files])
     table = _FEWEST_ROWS if len(checked) > 1 else 0
-    finding_texts = _finding_lines(_alike(checked), room - table, width, len(checked))
-    logs = _log_lines(checked, room - len(finding_texts), width) if table else []
-    skipped = _skipped_lines(checked, _TEXT_LINES + max(room - len(finding_texts) - len(logs), 0), width)
-    return [*head, *finding_texts, *logs, *rolling, *skipped, *files]
+    finding_lines = _finding_lines(_alike(checked), room - table, width, len(checked))
+    logs = _log_lines(checked, room - len(finding_lines), width) if table else []
+    skipped = _skipped_lines(checked, _TEXT_LINES + max(room - len(finding_lines) - len(logs), 0), width)
+    return [*head, *finding_lines, *logs, *rolling, *skipped, *files]
 
 
 def finding_parts(checked: Sequence[Checked], written: Sequence[str | None], width: int) -> list[str | Table]:

@@ -88,7 +88,7 @@ def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]
         lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
     output = run.experiment.config.output
     end = [] if output is None else [written_line(output)]
-    end += [line for labelled_text in last for line in labelled(*labelled_text, width, _TEXT_LINES)]
+    end += [line for label, text in last for line in labelled(label, text, width, _TEXT_LINES)]
     if len(lines) + len(end) > LINES:
         lines = [line for line in lines if not line.startswith(group_name(PRESSURE))]
     bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
@@ -327,9 +327,8 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
     return [*lines, written_line(evaluated.output)]
 
 
-def evaluation_parts(evaluated: EvaluatedRun, width: int) -> list[str | Table]:
+def evaluation_parts(evaluated: EvaluatedRun) -> list[str | Table]:
     """The errors of all logs by group of rows."""
-    del width
     return [*error_tables(evaluated.metrics, evaluated.robot.format), written_line(evaluated.output)]
 
 

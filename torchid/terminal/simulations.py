@@ -8,11 +8,22 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping
 
+from rich.table import Table
+
 from torchid.commands.replay import Replay
 from torchid.commands.simulate import nominal_name, simulated_balls
 from torchid.config import SimulationConfig
 from torchid.errors import format_count, format_percent
-from torchid.report.tables import LINES, column_lines, labelled, rolling_lines, rows_within, wrap_words, written_line
+from torchid.report.tables import (
+    LINES,
+    column_lines,
+    labelled,
+    make_table,
+    rolling_lines,
+    rows_within,
+    wrap_words,
+    written_line,
+)
 from torchid.simulation import Stability
 
 _TEXT_LINES = 2
@@ -37,10 +48,12 @@ def simulation_lines(config: SimulationConfig, stabilities: Mapping[str, Stabili
     return [*lines, *_motion_lines(config, stabilities, room, width), *end]
 
 
-def all_motion_lines(config: SimulationConfig, stabilities: Mapping[str, Stability], width: int) -> list[str]:
-    """How the robot stood in every motion."""
-    table = column_lines(("motion", list(stabilities)), _columns(stabilities.values()), width)
-    return [*rolling_lines(simulated_balls(config), width), *table, written_line(config.output)]
+def all_motion_lines(config: SimulationConfig, stabilities: Mapping[str, Stability], width: int) -> list[str | Table]:
+    """How the robot stood in every motion, with all columns whatever the width."""
+    columns = _columns(stabilities.values())
+    rows = zip(stabilities, *(texts for _, texts in columns), strict=True)
+    table = make_table("Standing", ("motion", *(heading for heading, _ in columns)), rows)
+    return [*rolling_lines(simulated_balls(config), width), table, written_line(config.output)]
 
 
 def _headline(config: SimulationConfig, stabilities: Mapping[str, Stability]) -> str:
