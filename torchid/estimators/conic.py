@@ -578,8 +578,7 @@ _SHARE = 0.98  # of the longest step that stays inside
 _CENTRE_SHRINK = 0.1  # of the barrier's weight from step to step towards a point of the central path
 _CENTRED_CHANGE = 1e-9  # relative, of blocks and slacks, in the last of these steps
 _SHORT = 0.2  # length of a corrected step below which a plain one is taken
-# complementarity, relative to the objective, from which on the gap itself is computed
-_ACCURATE = 1e-9
+_ACCURATE = 1e-9  # complementarity, relative to the objective, from which on the gap itself is computed
 _CENTRED = 0.5
 
 
@@ -613,7 +612,7 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
         after = path.step(point)
         if after is not None:
             point = after
-            steps = steps + 1
+            steps += 1
         x = point.x.numpy()
         objective = problem.objective(x)
         last = after is None or count == _STEPS
@@ -685,30 +684,21 @@ class PrimalDual:
         self.null_space = torch.from_numpy(problem.null_space) if len(problem.e) else None
         self.eye = torch.eye(4, dtype=self.F0.dtype)
 
-    def with_rows(self, stiffness: Tensor) -> Tensor:
-        """Hessian of the quadratic and of rows with a stiffness each, (M,): H + G^T diag(stiffness) G, (n, n)."""
-        at = self._row_columns
-        return self.H.index_put((at[:, None], at), self._rows.T @ (stiffness[:, None] * self._rows), accumulate=True)
-
     def factors(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
         """Cholesky factors (K, 4, 4) of the blocks and slacks (M,) of the rows at x, (n,); None if it is infeasible."""
         root, failed = torch.linalg.cholesky_ex(self.F0 + (x[self.variables, None, None] * self.F).sum(1))
         slack = self.G @ x - self.h
         return None if failed.any() or not (slack > 0.0).all() else (root, slack)
 
-    def feasible_factors(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The same of a point that is strictly feasible; LinAlgError where rounding says that it is not."""
-        factors = self.factors(x)
+    def start(self, x: np.ndarray) -> _Point:
+        """A feasible x, (n,), with multipliers of the central path; LinAlgError where rounding says that it is not."""
+        at = torch.from_numpy(x.copy())
+        factors = self.factors(at)
         if factors is None:
             raise np.linalg.LinAlgError("by rounding, the starting point is not strictly feasible")
-        return factors
-
-    def start(self, x: np.ndarray) -> _Point:
-        """A strictly feasible x, (n,), with the multipliers of a point of the central path."""
-        factors = self.feasible_factors(torch.from_numpy(x.copy()))
         kappa = max(self.problem.objective(x), self.problem.floor) / max(self.problem.degree, 1)
         Z = (self.weights + kappa)[:, None, None] * self.eye
-        return self._point(torch.from_numpy(x.copy()), factors, Z, kappa / factors[1])
+        return self._point(at, factors, Z, kappa / factors[1])
 
     def _point(self, x: Tensor, factors: tuple[Tensor, Tensor], Z: Tensor, y: Tensor) -> _Point:
         """The point x, (n,), of these `factors`, with its multipliers."""
@@ -778,10 +768,10 @@ class PrimalDual:
 
         curvature = flat @ (whitened @ point.Z[:, None]).flatten(2).mT
         stiffness = point.y / point.slack
-        hessian = self.with_rows(stiffness)
-        rows = self.variables[:, :, None]
-        columns = self.variables[:, None, :]
-        hessian.index_put_((rows.expand_as(curvature), columns.expand_as(curvature)), curvature, accumulate=True)
+        of_rows = self._rows.T @ (stiffness[:, None] * self._rows)
+        at = self._row_columns
+        hessian = self.H.index_put((at[:, None], at), of_rows, accumulate=True)
+        hessian.index_put_((self.variables[:, :, None], self.variables[:, None]), curvature, accumulate=True)
         N = self.null_space
         invert = damped_inverse(hessian if N is None else N.T @ hessian @ N)
         gradient = torch.from_numpy(self.problem.gradient(point.x.numpy())) - self.G.T @ point.y - gathered(point.Z)

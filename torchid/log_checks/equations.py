@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from torchid import parameters
 from torchid.errors import TorchidWarning
-from torchid.log_checks.findings import median_step
+from torchid.log_checks.findings import Finding, median_step
 from torchid.logs import Log
 from torchid.logs.cutoff import usual_cutoff_hz
 from torchid.logs.log import BoolArray, FloatArray, SignalNoise
@@ -56,6 +56,16 @@ PIECES = 4
 #: Torque below the resolution of any sensor.
 MIN_TORQUE_NM = 1e-9
 _TINY = 1e-12
+#: Unexplained forces without the unknowns over those with them; the same where these leave more than `MAX_LEFT`, as
+#: of another robot, or where other joints have forces that no model explains.
+MIN_UNEXPLAINED_RATIO = 1.25
+MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT = 1.5
+MAX_LEFT = 1.5
+#: How far the factor of a reversed torque may be from -1, and that of a unit from it.
+FACTOR_TOLERANCE_RATIO = 3.0
+#: Corrections of a log by its unknowns, at most, and the step after which it needs none.
+_STEPS = 8
+_LEAST_STEP = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -528,3 +538,164 @@ def reading_noise(log: Log, robot: Robot) -> FloatArray:
         if name in robot.joint_names and len(known) > 20:
             noise[robot.joint_names.index(name)] = rough_noise(known[:, None]).item()
     return noise
+
+
+# -------------------------------------------------------------------------------------- kinds of mistakes
+
+Findings = Callable[[Sequence[int], Estimate], list[Finding]]
+Moved = Callable[[FloatArray], tuple[ForceEquations, FloatArray] | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """A kind of mistake with its unknowns: one row of the table.
+
+    Attributes:
+        columns: of the unknowns, (N, n_rows, k).
+        prior_std: of the unknowns, (k,) or of each.
+        is_large: which unknowns (k,) are large enough to be named.
+        findings: about unknowns that are named, by their numbers and estimate.
+        moved: equations and columns of the log without the unknowns (k,), where columns hold for small ones alone.
+        bounded: whether unknowns are gains less 1, which must be large by either regression, and these agree.
+        single: whether one unknown alone is wrong.
+        constants: whether there may be constant torques beside them.
+        together: size of groups of successive unknowns that are named together.
+        steady: whether every block of time must show the unknowns.
+        equations: that the columns are of, None: those of the log.
+    """
+
+    columns: FloatArray
+    prior_std: FloatArray | float
+    is_large: Callable[[FloatArray], BoolArray]
+    findings: Findings
+    moved: Moved | None = None
+    bounded: bool = False
+    single: bool = False
+    constants: bool = True
+    together: int = 1
+    steady: bool = True
+    equations: ForceEquations | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Findings about a mistake, and what the forces leave unexplained without it.
+
+    `value`: (count,), of its `count` unknowns.
+    """
+
+    findings: Sequence[Finding]
+    left: float
+    count: int
+    value: FloatArray
+
+
+def explain(equations: ForceEquations, kind: Kind) -> Explanation | None:
+    """What clear unknowns of a kind explain; None without any."""
+    equations = kind.equations or equations
+    reduced = equations.reduced(kind.columns, kind.constants)
+    count = kind.columns.shape[2]
+    if kind.single:
+        product = reduced.products[0, 0, 1:]
+        square = np.maximum(np.diagonal(reduced.products[0])[1:], 1e-300)
+        possible = np.flatnonzero(kind.is_large(product / square))
+        which = possible[np.argsort(-np.square(product[possible]) / square[possible])][:1]
+    else:
+        which = np.arange(count)
+        for _ in range(2):
+            estimate = reduced.fit(which, _prior(kind, which))
+            which = which[_possible(kind, which, reduced, estimate)]
+    if not len(which):
+        return None
+    estimate = reduced.fit(which, _prior(kind, which))
+    applied = np.zeros(count)
+    if kind.moved is not None:
+        estimate, reduced = _corrected(kind, which, estimate, reduced, applied)
+    clear = estimate.certain & estimate.steady if kind.steady else estimate.certain
+    named = _named(kind, which, reduced, estimate, clear, 1.0 + applied[which])
+    without = equations.reduced(kind.columns[..., :0], kind.constants).left
+    is_another = estimate.left > MAX_LEFT
+    least_ratio = MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT if is_another else MIN_UNEXPLAINED_RATIO
+    if not named.any() or not without > least_ratio * estimate.left:
+        return None
+    findings = kind.findings(which[named].tolist(), estimate.of(named))
+    return Explanation(findings, estimate.left, len(which), estimate.value) if findings else None
+
+
+def _prior(kind: Kind, which: NDArray[np.intp]) -> FloatArray:
+    return np.broadcast_to(kind.prior_std, kind.columns.shape[2])[which]
+
+
+def _possible(kind: Kind, which: NDArray[np.intp], reduced: ReducedEquations, estimate: Estimate) -> BoolArray:
+    """Which of some unknowns may be named; of a lag, which a corrected log makes clearer, half as much suffices."""
+    if kind.moved is None or kind.columns.shape[2] > kind.together or kind.bounded:
+        return _named(kind, which, reduced, estimate, estimate.certain)
+    near = replace(estimate, value=2.0 * estimate.value)
+    return _named(kind, which, reduced, near, near.certain)
+
+
+def _named(
+    kind: Kind,
+    which: NDArray[np.intp],
+    reduced: ReducedEquations,
+    estimate: Estimate,
+    certain: BoolArray,
+    applied: FloatArray | None = None,
+) -> BoolArray:
+    """Which of some unknowns are `certain` and large, in groups of those that belong together.
+
+    `applied`: gains that the readings have got; None before a last estimate, by which gains must be clear.
+    """
+    named = certain & kind.is_large(estimate.value)
+    if kind.bounded and len(which):
+        gain = 1.0 + estimate.value
+        reverse = reduced.select(which).reverse_gains(gain, 1.0 if applied is None else applied)
+        named &= kind.is_large(reverse - 1.0)
+        if applied is not None:
+            named &= _are_apart_from_1(gain, reverse)
+    if kind.together > 1:
+        groups = which // kind.together
+        named = np.isin(groups, groups[named])
+    return named
+
+
+def _are_apart_from_1(gain: FloatArray, reverse: FloatArray) -> BoolArray:
+    """Which gains by two regressions, between which the truth is, are so close to each other that it is not 1.
+
+    Of gains of one sign on the same side of 1 the further one may be the third power of the other: torques that
+    armature makes up, which URDFs seldom state, have 0.13 and 0.75. Negative ones may be as far apart as reversed ones.
+    """
+    logs = np.log(np.maximum(np.abs([gain, reverse]), 1e-12))
+    least = np.where(gain < 0.0, np.log(FACTOR_TOLERANCE_RATIO), np.abs(logs).min(axis=0))
+    return np.asarray(np.abs(logs[0] - logs[1]) < 2.0 * least)
+
+
+def _corrected(
+    kind: Kind, which: NDArray[np.intp], first: Estimate, reduced: ReducedEquations, total: FloatArray
+) -> tuple[Estimate, ReducedEquations]:
+    """The estimate by a log whose unknowns are corrected by what is estimated, until nothing is left of them.
+
+    `total`: gets what the log was corrected by, (k,).
+    """
+    estimate = first
+    step = first.value
+    for _ in range(_STEPS):
+        moved = None if kind.moved is None else kind.moved(total + _scattered(step, which, len(total)))
+        if moved is None:
+            break
+        total[which] += step
+        equations, columns = moved
+        reduced = equations.reduced(columns, kind.constants)
+        fit = reduced.fit(which, _prior(kind, which))
+        step = fit.value
+        estimate = replace(fit, value=step + total[which], blocks=fit.blocks + total[which], without=first.without)
+        if np.abs(step).max() < _LEAST_STEP:
+            break
+    return estimate, reduced
+
+
+def _scattered(values: FloatArray, which: NDArray[np.intp], count: int) -> FloatArray:
+    """Values of some of `count` unknowns, and 0 for the others."""
+    out = np.zeros(count)
+    out[which] = values
+    return out

@@ -13,10 +13,13 @@ from torchid import parameters
 from torchid.errors import InputError, format_percent, join_names
 from torchid.log_checks.equations import (
     DECLARED_SCALE,
+    MAX_LEFT,
     MIN_BLOCK_SHARE,
+    MIN_UNEXPLAINED_RATIO,
     SCALED_TORQUE_STD,
     UNMODELLED_FORCE_SHARE,
     Declared,
+    Explanation,
     FilteredLog,
     ForceEquations,
     NominalModel,
@@ -31,11 +34,8 @@ from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED,
 from torchid.log_checks.mistakes import Mistake, joint_mistakes, possible_mistakes
 from torchid.log_checks.motion import still_joints
 from torchid.log_checks.unknowns import (
-    MAX_LEFT,
     MIN_UNEXPLAINED,
-    MIN_UNEXPLAINED_RATIO,
     READINGS,
-    Explanation,
     best_explanation,
 )
 from torchid.logs import Log

@@ -7,23 +7,26 @@ same equations and judged by one rule; the kind whose clear unknowns leave least
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from torchid.errors import join_names
 from torchid.log_checks.equations import (
+    FACTOR_TOLERANCE_RATIO,
+    MIN_UNEXPLAINED_RATIO,
     Estimate,
+    Explanation,
     FilteredLog,
     ForceEquations,
+    Kind,
     NominalModel,
-    ReducedEquations,
     bind_some_samples,
     equations_of,
+    explain,
     some_samples,
 )
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, Finding
@@ -38,11 +41,6 @@ from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.robot.urdf import position_limits
 
-#: Unexplained forces without the unknowns over those with them; the same where these leave more than `MAX_LEFT`, as
-#: of another robot, or where other joints have forces that no model explains.
-MIN_UNEXPLAINED_RATIO = 1.25
-MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT = 1.5
-MAX_LEFT = 1.5
 #: Kinds that leave as much as the best one, up to this ratio: the one with the fewest unknowns is named.
 _ALIKE_RATIO = 1.1
 #: Unexplained forces below which kinds leave as much: half a percent of the forces.
@@ -59,8 +57,6 @@ _MAX_LAG_S = 0.5
 _MAX_LAG_SHARE = 0.25
 #: Prior of the factor of all wrenches: of kN to N.
 _MAX_UNIT_RATIO = 1e3
-#: How far the factor of a reversed torque may be from -1, and that of a unit from it.
-_FACTOR_TOLERANCE_RATIO = 3.0
 #: Offset of a torque over the rms of all torques: those of good sensors are 0.08 of it.
 MIN_OFFSET_SHARE = 0.1
 #: Zero of a hinge [rad] or slide [m], tilt of gravity and turn of a sensor [rad], shift of the point of wrenches [m].
@@ -87,57 +83,8 @@ MIN_UNEXPLAINED = 0.5
 #: Fields that change no motion.
 READINGS = ("joint_torque", *WRENCHES)
 _SMALL = 1e-4
-_STEPS = 8
-_LEAST_STEP = 2e-3
 _OF_BASE = ("base_", "imu_")
 _OF_JOINTS = ("joint_position", "joint_velocity", "joint_acceleration")
-
-Findings = Callable[[Sequence[int], Estimate], list[Finding]]
-Moved = Callable[[FloatArray], tuple[ForceEquations, FloatArray] | None]
-
-
-@dataclass(frozen=True, eq=False)
-class Kind:
-    """A kind of mistake with its unknowns: one row of the table.
-
-    Attributes:
-        columns: of the unknowns, (N, n_rows, k).
-        prior_std: of the unknowns, (k,) or of each.
-        is_large: which unknowns (k,) are large enough to be named.
-        findings: about unknowns that are named, by their numbers and estimate.
-        moved: equations and columns of the log without the unknowns (k,), where columns hold for small ones alone.
-        bounded: whether unknowns are gains less 1, which must be large by either regression, and these agree.
-        single: whether one unknown alone is wrong.
-        constants: whether there may be constant torques beside them.
-        together: size of groups of successive unknowns that are named together.
-        steady: whether every block of time must show the unknowns.
-        equations: that the columns are of, None: those of the log.
-    """
-
-    columns: FloatArray
-    prior_std: FloatArray | float
-    is_large: Callable[[FloatArray], BoolArray]
-    findings: Findings
-    moved: Moved | None = None
-    bounded: bool = False
-    single: bool = False
-    constants: bool = True
-    together: int = 1
-    steady: bool = True
-    equations: ForceEquations | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Explanation:
-    """Findings about a mistake, and what the forces leave unexplained without it.
-
-    `value`: (count,), of its `count` unknowns.
-    """
-
-    findings: Sequence[Finding]
-    left: float
-    count: int
-    value: FloatArray
 
 
 def best_explanation(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> Explanation | None:
@@ -174,117 +121,6 @@ def best_explanation(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> Ex
     ratio = equations.unexplained / max(best.left, 1e-9)
     found_text = f"{first.found}{also}; without this correction {ratio:.2g} times as much of the forces is unexplained"
     return replace(best, findings=[replace(first, found=found_text), *more])
-
-
-def explain(equations: ForceEquations, kind: Kind) -> Explanation | None:
-    """What clear unknowns of a kind explain; None without any."""
-    equations = kind.equations or equations
-    reduced = equations.reduced(kind.columns, kind.constants)
-    count = kind.columns.shape[2]
-    if kind.single:
-        product = reduced.products[0, 0, 1:]
-        square = np.maximum(np.diagonal(reduced.products[0])[1:], 1e-300)
-        possible = np.flatnonzero(kind.is_large(product / square))
-        which = possible[np.argsort(-np.square(product[possible]) / square[possible])][:1]
-    else:
-        which = np.arange(count)
-        for _ in range(2):
-            estimate = reduced.fit(which, _prior(kind, which))
-            which = which[_possible(kind, which, reduced, estimate)]
-    if not len(which):
-        return None
-    estimate = reduced.fit(which, _prior(kind, which))
-    applied = np.zeros(count)
-    if kind.moved is not None:
-        estimate, reduced = _corrected(kind, which, estimate, reduced, applied)
-    clear = estimate.certain & estimate.steady if kind.steady else estimate.certain
-    named = _named(kind, which, reduced, estimate, clear, 1.0 + applied[which])
-    without = equations.reduced(kind.columns[..., :0], kind.constants).left
-    is_another = estimate.left > MAX_LEFT
-    least_ratio = MIN_UNEXPLAINED_RATIO_OF_ANOTHER_ROBOT if is_another else MIN_UNEXPLAINED_RATIO
-    if not named.any() or not without > least_ratio * estimate.left:
-        return None
-    findings = kind.findings(which[named].tolist(), estimate.of(named))
-    return Explanation(findings, estimate.left, len(which), estimate.value) if findings else None
-
-
-def _prior(kind: Kind, which: NDArray[np.intp]) -> FloatArray:
-    return np.broadcast_to(kind.prior_std, kind.columns.shape[2])[which]
-
-
-def _possible(kind: Kind, which: NDArray[np.intp], reduced: ReducedEquations, estimate: Estimate) -> BoolArray:
-    """Which of some unknowns may be named; of a lag, which a corrected log makes clearer, half as much suffices."""
-    if kind.moved is None or kind.columns.shape[2] > kind.together or kind.bounded:
-        return _named(kind, which, reduced, estimate, estimate.certain)
-    near = replace(estimate, value=2.0 * estimate.value)
-    return _named(kind, which, reduced, near, near.certain)
-
-
-def _named(
-    kind: Kind,
-    which: NDArray[np.intp],
-    reduced: ReducedEquations,
-    estimate: Estimate,
-    certain: BoolArray,
-    applied: FloatArray | None = None,
-) -> BoolArray:
-    """Which of some unknowns are `certain` and large, in groups of those that belong together.
-
-    `applied`: gains that the readings have got; None before a last estimate, by which gains must be clear.
-    """
-    named = certain & kind.is_large(estimate.value)
-    if kind.bounded and len(which):
-        gain = 1.0 + estimate.value
-        reverse = reduced.select(which).reverse_gains(gain, 1.0 if applied is None else applied)
-        named &= kind.is_large(reverse - 1.0)
-        if applied is not None:
-            named &= _are_apart_from_1(gain, reverse)
-    if kind.together > 1:
-        groups = which // kind.together
-        named = np.isin(groups, groups[named])
-    return named
-
-
-def _are_apart_from_1(gain: FloatArray, reverse: FloatArray) -> BoolArray:
-    """Which gains by two regressions, between which the truth is, are so close to each other that it is not 1.
-
-    Of gains of one sign on the same side of 1 the further one may be the third power of the other: torques that
-    armature makes up, which URDFs seldom state, have 0.13 and 0.75. Negative ones may be as far apart as reversed ones.
-    """
-    logs = np.log(np.maximum(np.abs([gain, reverse]), 1e-12))
-    least = np.where(gain < 0.0, np.log(_FACTOR_TOLERANCE_RATIO), np.abs(logs).min(axis=0))
-    return np.asarray(np.abs(logs[0] - logs[1]) < 2.0 * least)
-
-
-def _corrected(
-    kind: Kind, which: NDArray[np.intp], first: Estimate, reduced: ReducedEquations, total: FloatArray
-) -> tuple[Estimate, ReducedEquations]:
-    """The estimate by a log whose unknowns are corrected by what is estimated, until nothing is left of them.
-
-    `total`: gets what the log was corrected by, (k,).
-    """
-    estimate = first
-    step = first.value
-    for _ in range(_STEPS):
-        moved = None if kind.moved is None else kind.moved(total + _scattered(step, which, len(total)))
-        if moved is None:
-            break
-        total[which] += step
-        equations, columns = moved
-        reduced = equations.reduced(columns, kind.constants)
-        fit = reduced.fit(which, _prior(kind, which))
-        step = fit.value
-        estimate = replace(fit, value=step + total[which], blocks=fit.blocks + total[which], without=first.without)
-        if np.abs(step).max() < _LEAST_STEP:
-            break
-    return estimate, reduced
-
-
-def _scattered(values: FloatArray, which: NDArray[np.intp], count: int) -> FloatArray:
-    """Values of some of `count` unknowns, and 0 for the others."""
-    out = np.zeros(count)
-    out[which] = values
-    return out
 
 
 # ------------------------------------------------------------------------------------------------------- table of kinds
@@ -412,7 +248,7 @@ def _has_declared_scale(equations: ForceEquations, joint: int) -> bool:
 
 def _is_reverse(x: FloatArray) -> BoolArray:
     """Which gains less 1 are those of reversed readings."""
-    return np.asarray((1.0 + x < -1.0 / _FACTOR_TOLERANCE_RATIO) & (1.0 + x > -_FACTOR_TOLERANCE_RATIO))
+    return np.asarray((1.0 + x < -1.0 / FACTOR_TOLERANCE_RATIO) & (1.0 + x > -FACTOR_TOLERANCE_RATIO))
 
 
 def _is_whole(x: FloatArray) -> BoolArray:
@@ -445,7 +281,7 @@ def _single_gains(names: Sequence[str], gain: FloatArray, spread: FloatArray, ro
     for name, x in zip(names, gain, strict=True):
         expected = "N" if name in robot.sliding else "N m"
         near = [
-            k for k, f in (("m", 1e-3), ("k", 1e3)) if abs(np.log(max(x / f, 1e-9))) < np.log(_FACTOR_TOLERANCE_RATIO)
+            k for k, f in (("m", 1e-3), ("k", 1e3)) if abs(np.log(max(x / f, 1e-9))) < np.log(FACTOR_TOLERANCE_RATIO)
         ]
         units |= {name: (near[0] + expected, expected)} if near else {}
     of_unknown_scale = [

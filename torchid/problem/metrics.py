@@ -768,10 +768,7 @@ class WorseThanNominal:
 
 
 def describe_worse(groups: list[WorseThanNominal], nominal_label: str) -> str | None:
-    """One line that lists the groups, None if there are none.
-
-    `of`: what the nominal parameters are those of, as `Robot.format`.
-    """
+    """One line that lists the groups, None if there are none; `nominal_label`: "URDF" or "MJCF"."""
     if not groups:
         return None
     by_logs = {group.logs: [str(other) for other in groups if other.logs == group.logs] for group in groups}

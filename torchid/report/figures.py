@@ -311,7 +311,7 @@ Position = tuple[float, int]
 
 @matplotlib.rc_context(STYLE)
 def error_figure(sets: Mapping[str, Comparison[Metrics]], nominal_label: str = "URDF") -> Figure:
-    """Relative error by group of rows, nominal (`of` what) against identified, one panel per set of logs."""
+    """Relative error by group of rows, nominal (of `nominal_label`) against identified, one panel per set of logs."""
     figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):

@@ -15,9 +15,10 @@ from torchid.parameters import Array
 from torchid.report.urdf_files import mass_bounds, share_with_links_beyond_welds, warn_if_inconsistent
 from torchid.robot import Robot
 from torchid.robot.meshes import MeshError, mesh_path
-from torchid.robot.mjcf import MjcfModel, body_elements, mujoco_error, parse_model
+from torchid.robot.mjcf import MjcfModel, mujoco_error, parse_model
 from torchid.robot.tree import Mimic, joint_origin, link_parameters, resolve_mimics
 from torchid.robot.urdf import MOVING_TYPES, TreeJoint, parse_xml, position_limits, read_urdf
+from torchid.robot.xml_files import body_elements
 
 NAME = "identified.xml"
 _RULES = ("settotalmass", "boundmass", "boundinertia", "balanceinertia")
