@@ -387,7 +387,7 @@ def _driving_friction(filtered: FilteredLog, equations: ForceEquations) -> Itera
         load = parts[:, 2:].sum(axis=1)
         others = np.linalg.norm(load) + np.linalg.norm(torque - friction - load)
         if friction @ velocity < 0.0 and np.linalg.norm(friction) > _MIN_FRICTION_RATIO * others:
-            text = f"{name}: reversed: most of it is friction, which would drive the joint"
+            text = f"{name}: reversed: most of the torque is friction, which would drive the joint"
             advice = "reverse these torques; or positions and velocities, if these are"
             yield Finding("sign", REJECTED, "joint_torque", text, advice, (name,))
 

@@ -439,10 +439,9 @@ def _gravity_kind(equations: ForceEquations) -> Kind:
 
     def findings(_: Sequence[int], estimate: Estimate) -> list[Finding]:
         percent = f"{100.0 * estimate.value[0]:.0f} +- {100.0 * estimate.spread[0]:.0f} %"
-        text = f"torques lack {percent} of gravity: a controller"
-        advice = "record torques before gravity is subtracted, not those of external forces, nor commands beside"
-        advice += " gravity's; or add what was subtracted"
-        return [Finding("gravity", REJECTED, "joint_torque", f"{text} has compensated it?", advice)]
+        text = f"torques lack {percent} of gravity: has a controller subtracted it?"
+        advice = "record torques before gravity is subtracted, or add what was subtracted"
+        return [Finding("gravity", REJECTED, "joint_torque", text, advice)]
 
     low, high = ALL_OF_GRAVITY
     columns = equations.required_of(still)[..., None]
@@ -535,7 +534,7 @@ def tilt_kind(equations: ForceEquations) -> Kind:
         advice = f"{advice}, or set robot.base_tilt: auto"
         if model.declared.finds_tilt:
             severity = NOTE
-            advice = "nothing: robot.base_tilt: auto finds it"
+            advice = "none: robot.base_tilt: auto finds it"
         return [Finding("tilt", severity, "base" if robot.fixed_base else "base_quat_xyzw", text, advice)]
 
     return Kind(columns, 0.3, lambda x: np.abs(x) > MIN_TILT, findings, together=2)

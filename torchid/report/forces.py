@@ -74,7 +74,7 @@ def force_figure(
 ) -> Figure:
     """Forces over time, and beside them their errors: the largest base force and moment, then the largest others.
 
-    `dof_names`, `base_rows` and `sliding` are those of the robot, `nominal_label` is what its nominal parameters are from.
+    `dof_names`, `base_rows` and `sliding` are those of the robot, `nominal_label` is its kind of file.
     """
     names = _largest(series, dof_names, base_rows, sliding)
     known = int(np.isfinite(series.measured).any(axis=0).sum())
