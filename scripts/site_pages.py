@@ -1,4 +1,4 @@
-"""Pages of the site that other files hold: README and the like, every key of the experiment file, every public name.
+"""Pages of the site that other files hold: README and the like, every key, every message, every public name.
 
 A hook of MkDocs (`mkdocs.yml`): `mkdocs serve` shows the site, `mkdocs build` writes it to `site/`.
 """
@@ -10,7 +10,7 @@ import dataclasses
 import inspect
 import re
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)\s#]+)(#[^)]*)?\)")
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made here."""
     made = {page: _relinked((_ROOT / name).read_text(), "") for name, page in _PAGES.items()}
-    made |= {"keys.md": keys_page(), "reference.md": reference_page()}
+    made |= {"keys.md": keys_page(), "messages.md": messages_page(), "reference.md": reference_page()}
     for name, text in made.items():
         files.append(File.generated(config, name, content=text))
     return files
@@ -219,6 +219,111 @@ def _yaml(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+# ------------------------------------------------------------------------------------------------------------ messages
+
+_PACKAGE = _ROOT / "torchid"
+_SEVERITIES = {"REJECTED": "rejected", "SUSPICIOUS": "suspicious", "NOTE": "note"}
+_ERROR_CLASSES = ("LogError", "UrdfError", "ConfigError", "SensorError", "InputError", "ImplausibleFitError")
+_MOST_ALTERNATIVES = 6
+_FEWEST_WORDS = 4
+
+
+def messages_page() -> str:
+    """Every finding of `torchid check`, remark of `torchid identify` and error, read from the source of the package."""
+    findings = dict.fromkeys(row for path in sorted((_PACKAGE / "log_checks").glob("*.py")) for row in _findings(path))
+    remarks = dict.fromkeys(_remarks(_PACKAGE / "commands" / "answer.py"))
+    errors = dict.fromkeys(row for path in sorted(_PACKAGE.rglob("*.py")) for row in _errors(path))
+    tables = (
+        ("Findings of `torchid check`", ("name", "severity", "torchid says", "what to do"), sorted(findings)),
+        ("Remarks of `torchid identify`", ("torchid says",), [(remark,) for remark in remarks]),
+        ("Errors", ("what is wrong", "what is accepted"), sorted(errors)),
+    )
+    parts = ["# Every message", '"…" stands for a name or a number. An error begins with the file and the field.']
+    for title, columns, rows in tables:
+        lines = [columns, ("---",) * len(columns), *rows]
+        parts += [f"## {title}", "\n".join(f"| {' | '.join(map(_cell, line))} |" for line in lines)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _cell(text: str) -> str:
+    return re.sub(r"([|<>*_\[\]])", r"\\\1", text)
+
+
+def _findings(path: Path) -> Iterator[tuple[str, str, str, str]]:
+    """Name, severity, text and advice of each finding that a module makes."""
+    for function in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)):
+        above = function.lineno
+        for call in _calls(function, ("Finding",)):
+            if len(call.args) >= 5:
+                name, severity, _, found, advice = call.args[:5]
+                said = [_alternatives(part, function, above, call.lineno) for part in (name, found, advice)]
+                label = _SEVERITIES.get(ast.unparse(severity), "by size")
+                yield said[0], label, said[1], said[2]
+            above = call.lineno
+
+
+def _remarks(path: Path) -> Iterator[str]:
+    """Sentences of a module in its order."""
+    tree = ast.parse(path.read_text())
+    described = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    parts = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in ast.walk(node)}
+    for node in ast.walk(tree):
+        whole = isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and id(node) not in parts)
+        text = _texts(node, {})[0] if whole and id(node) not in described else ""
+        if len(text.split()) >= _FEWEST_WORDS and text[0] not in " ,;":
+            yield text
+
+
+def _errors(path: Path) -> Iterator[tuple[str, str]]:
+    """What errors of a module say is wrong and is accepted."""
+    for function in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)):
+        for call in _calls(function, _ERROR_CLASSES):
+            if len(call.args) >= 3:
+                wrong, accepted = (_alternatives(x, function, function.lineno, call.lineno) for x in call.args[-2:])
+                if len(wrong.split()) + len(accepted.split()) >= _FEWEST_WORDS:
+                    yield wrong, accepted
+
+
+def _calls(function: ast.FunctionDef, names: Sequence[str]) -> list[ast.Call]:
+    """Calls of classes, or of their `at_field`, in a function from top to bottom."""
+    calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
+    named = [call for call in calls if ast.unparse(call.func).removesuffix(".at_field") in names]
+    return sorted(named, key=lambda call: call.lineno)
+
+
+def _alternatives(node: ast.expr, function: ast.FunctionDef, above: int, line: int) -> str:
+    """The texts that an argument of a call at a line may be; of names those assigned since the call `above`."""
+    assigned: dict[str, list[tuple[int, ast.expr]]] = {}
+    for statement in ast.walk(function):
+        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name) and statement.lineno < line:
+            assigned.setdefault(statement.targets[0].id, []).append((statement.lineno, statement.value))
+    known = {}
+    for name, values in assigned.items():
+        recent = [value for number, value in values if number > above]
+        known[name] = recent or [max(values, key=lambda value: value[0])[1]]
+    return "; or: ".join(dict.fromkeys(_texts(node, known)))
+
+
+def _texts(node: ast.expr, known: Mapping[str, list[ast.expr]]) -> list[str]:
+    """What an expression may be as text; "…" for what only a run knows."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return [" ".join(node.value.split("\n"))]
+    if isinstance(node, ast.JoinedStr):
+        texts = [""]
+        for part in node.values:
+            inner = part.value if isinstance(part, ast.FormattedValue) else part
+            texts = [text + more for text in texts for more in _texts(inner, known)]
+        return texts[:_MOST_ALTERNATIVES]
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        return [x + y for x in _texts(node.left, known) for y in _texts(node.right, known)][:_MOST_ALTERNATIVES]
+    if isinstance(node, ast.IfExp):
+        return _texts(node.body, known) + _texts(node.orelse, known)
+    if isinstance(node, ast.Name) and node.id in known:
+        others = {name: values for name, values in known.items() if name != node.id}
+        return [text for value in known[node.id] for text in _texts(value, others)][:_MOST_ALTERNATIVES]
+    return ["URDF" if re.fullmatch(r"(\w+\.)*(robot\.format|form|nominal_label)", ast.unparse(node)) else "…"]
 
 
 # ------------------------------------------------------------------------------------------------------- public names

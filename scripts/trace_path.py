@@ -6,7 +6,7 @@
 Three paths:
 - identify: `torchid identify` as a whole, from the command line to the run folder;
 - log to phi: the part of it from the first call into `torchid/logs` until the parameters that it returns exist;
-- library: from `read_log` to `LeastSquares.solve` by the calls of docs/building_blocks.md, with the stated noise and
+- library: from `read_log` to `LeastSquares.solve` by the calls of docs/python.md, with the stated noise and
   without checks.
 
 Named functions are counted; lambdas, comprehensions and what runs while modules are imported are not.
@@ -107,7 +107,7 @@ def import_everything() -> None:
 
 
 def library_path(file: Path) -> None:
-    """From the first training log of an experiment file to phi by the calls of docs/building_blocks.md."""
+    """From the first training log of an experiment file to phi by the calls of docs/python.md."""
     settings = yaml.safe_load(file.read_text())
     sensors = settings["sensors"]
     chosen = sensors if isinstance(sensors, str) else sensors["set"]

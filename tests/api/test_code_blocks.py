@@ -88,7 +88,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def beside(folder: Path, page: str) -> dict[str, Any]:
     """What the pages speak of before they show it: a robot, its state, a fit."""
-    welds = ["l_ankle_ft"] if page == "sensors.md" else []
+    welds = ["l_ankle_ft"] if page == "contacts.md" else []
     robot = torchid.load_robot(folder / "robot.urdf", ft_joints=welds)
     said: dict[str, Any] = {"torchid": torchid, "robot": robot}
     said["contacts"] = contacts = [torchid.Contact("l_sole", "flat"), torchid.Contact("r_sole", "flat")]
@@ -100,18 +100,16 @@ def beside(folder: Path, page: str) -> dict[str, Any]:
     said["problem_of_a_log"], said["nominal"] = said["problem"], robot.nominal.flatten()
     q, v, a = (torch.zeros(3, size, dtype=torch.float64) for size in (robot.n + 7, robot.n + 6, robot.n + 6))
     q[:, 6] = 1.0
-    phi = said["nominal"]
-    said |= {"q": q, "v": v, "a": a, "phi": torch.from_numpy(phi) if page == "building_blocks.md" else phi}
+    said |= {"q": q, "v": v, "a": a, "phi": said["nominal"]}
     said["K"] = torchid.Regressor(robot)(q, v, a)
     said["active"] = torch.ones(3, 1, dtype=torch.bool)
     said |= {"torque": torch.zeros(3, robot.n, dtype=q.dtype), "wrench": torch.zeros(3, 6, dtype=q.dtype)}
     said["network"] = _Nothing(robot.nv)
     said["fitter"] = torchid.LogFitter(robot=robot, builder=builder, estimator=torchid.LeastSquares(0.01))
     said["paths"] = ["walk.factor"]
-    if page == "simulators.md":
+    if page == "simulation.md":
         (folder / "runs" / "robot").mkdir(parents=True)
         (folder / "runs" / "robot" / "identified.urdf").write_bytes((folder / "robot.urdf").read_bytes())
-    if page == "randomization.md":
         file = shortened_demo(folder / "short", 600) / "quadruped.yaml"
         torchid.identify(file, output=folder / "runs" / "g1", estimator={"name": "consistent", "ridge": 0.001})
     return said
@@ -135,7 +133,7 @@ class _Nothing(torch.nn.Module):
 @pytest.mark.parametrize("page", sorted({x.values[0] for x in blocks("python")} - ELSEWHERE))
 def test_python_of_the_pages_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Block after block, as a reader copies them."""
-    if page == "simulators.md":
+    if page == "simulation.md":
         pytest.importorskip("mujoco", reason="MuJoCo is not installed")
     monkeypatch.chdir(folder)
     monkeypatch.setattr(torchid, "Sgd", _two_epochs)
@@ -144,7 +142,7 @@ def test_python_of_the_pages_runs(page: str, folder: Path, monkeypatch: pytest.M
     said = beside(folder, page)
     for block in (x.values[1] for x in blocks("python") if x.values[0] == page):
         exec(compile(str(block), page, "exec"), said)
-    if page == "simulators.md":
+    if page == "simulation.md":
         robot, model = said["robot"], said["model"]
         assert model.nv == robot.nv
         assert model.body_mass.sum() == pytest.approx(robot.nominal[:, 0].sum(), rel=1e-3), (

@@ -7,9 +7,13 @@ import io
 import re
 import warnings
 from contextlib import redirect_stderr
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 
 import pytest
+from pages import browser_programs, opened
 
 import torchid
 
@@ -77,6 +81,38 @@ def test_keys_have_what_they_accept_and_their_defaults(site: Path, key: str) -> 
     assert row is not None
     default = re.sub(r"<[^>]+>", "", row.group(2))
     assert default == {"ridge": "auto"}.get(name, "null")
+
+
+def test_the_page_of_messages_has_findings_remarks_and_errors_as_they_are_said(site: Path) -> None:
+    findings, remarks, errors = re.split(r"<h2", (site / "messages" / "index.html").read_text())[1:4]
+    assert findings.count("<tr>") > 70
+    assert remarks.count("<tr>") > 30
+    assert errors.count("<tr>") > 300
+    rows = {re.sub(r"<[^>]+>", " ", row).split()[0] for row in findings.split("<tr>")[2:]}
+    assert {"offset", "delay", "frozen", "weight"} <= rows
+
+
+@pytest.mark.slow("every page, wide and narrow, in light and dark colours")
+@pytest.mark.skipif(browser_programs() is None, reason="Chromium or its driver is not installed")
+def test_pages_fit_wide_and_narrow_windows_in_light_and_dark_colours(site: Path, tmp_path: Path) -> None:
+    handler = partial(SimpleHTTPRequestHandler, directory=str(site))
+    pages = [page.parent.relative_to(site).as_posix() for page in site.rglob("index.html")]
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, opened(site / "index.html", tmp_path) as driver:
+        Thread(target=server.serve_forever, daemon=True).start()
+        driver.get_log("browser")  # of the page as a file, whose search asks for a server
+        for width, scheme in ((1280, "light"), (400, "dark")):
+            size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+            driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+            features = [{"name": "prefers-color-scheme", "value": scheme}]
+            driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+            for page in pages:
+                driver.get(f"http://127.0.0.1:{server.server_port}/{page}/")
+                shown = driver.execute_script(
+                    "return [document.documentElement.scrollWidth, document.body.dataset.mdColorScheme]"
+                )
+                assert shown == [min(width, shown[0]), {"light": "default", "dark": "slate"}[scheme]], page
+        assert [entry for entry in driver.get_log("browser") if entry["level"] == "SEVERE"] == []
+        server.shutdown()
 
 
 def test_public_names_are_described(site: Path) -> None:

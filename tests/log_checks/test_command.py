@@ -149,7 +149,7 @@ def test_an_overview_gives_the_range_of_every_channel_and_names_only_what_there_
 
 
 def test_the_documented_check_from_python_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "checking.md").read_text(), re.DOTALL)
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "logs.md").read_text(), re.DOTALL)
     monkeypatch.chdir(ROOT)
     said: dict[str, Any] = {}
     exec(code, said)

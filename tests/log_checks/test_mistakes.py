@@ -21,7 +21,7 @@ from torchid.log_checks.standing_feet import measure_foot_slip
 
 EXPLAINED = "unit, sign or frame"
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
-#: Cells of the whole table that are not named, and why: see docs/measurements.md.
+#: Cells of the whole table that are not named, and why: see docs/results.md.
 UNNAMED = {("wrenches about another point", "biped", "contacts")}
 #: Of a robot that walks upright along the world's x axis, with all sensors.
 UPRIGHT = study_but(

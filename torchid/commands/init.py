@@ -75,8 +75,8 @@ _IMU = ("imu_specific_force", "imu_angular_velocity")
 _WIDTH = 80  # of comments that list what has no entry
 _LISTED = 60  # lines of these
 _WHAT = {
-    "columns": "names, units and orders of the file: docs/tables.md",
-    "topics": "what the messages of the bag hold: docs/bags.md",
+    "columns": "names, units and orders of the file: docs/logs.md",
+    "topics": "what the messages of the bag hold: docs/logs.md",
 }
 _WELDED = "joints that the log lacks, held still; one that moves needs readings"
 

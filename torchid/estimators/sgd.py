@@ -51,7 +51,7 @@ OPTIMIZERS: dict[str, dict[str, Any]] = {
     "Rprop": {"lr": 0.2},
     "SGD": {"lr": 0.5},
 }
-"""The supported optimizers of torch, those that converge to the closed form (figures in docs/measurements.md).
+"""The supported optimizers of torch, those that converge to the closed form (figures in docs/results.md).
 
 With defaults of options that are not given: torch's own are for unknown curvature, while that of the preconditioned
 parameters is near one.
