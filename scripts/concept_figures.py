@@ -18,7 +18,6 @@ from matplotlib.figure import Figure
 import torchid
 from torchid.boundary import run_guarded
 from torchid.commands.run_folder import Identification
-from torchid.identifiability.base_parameters import structural_problem
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import force_series, null_space_part
 from torchid.reading.log_reader import LogReader
@@ -35,13 +34,6 @@ from torchid.report.figures import INTERVAL, identifiability_figure
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "torchid" / "demo" / "quadruped.yaml"
 TRUE_FRICTION = {"fc": 0.3, "fv": 0.05}  # of scripts/make_demo.py [N m, N m s/rad]
-STATES = {
-    "four feet": [(True, True, True, True)],
-    "two feet": [(True, False, False, True)],
-    "in the air": [(False, False, False, False)],
-    "all of these": [(True, True, True, True), (True, False, False, True), (False, False, False, False)],
-}
-SENSORS = {"contacts": NOMINAL_COLOR, "joints": IDENTIFIED_COLOR, "full": MEASURED_COLOR}
 
 
 def main() -> int:
@@ -53,13 +45,12 @@ def main() -> int:
 
 
 def draw(folder: Path) -> None:
-    """Write the four figures."""
+    """Write the three figures."""
     run = torchid.identify(DEMO, output=None)
     robot = run.experiment.robot
     with matplotlib.rc_context(STYLE):
         figures = {
             "concept_projection": projection_figure(*unmeasured_forces(run)),
-            "concept_observability": rank_figure(ranks(run)),
             "concept_verdicts": identifiability_figure(robot.body_names, run.estimate),
             "concept_intervals": interval_figure(run),
         }
@@ -81,49 +72,19 @@ def unmeasured_forces(run: Identification) -> tuple[Array, Array, Array]:
 
 
 def projection_figure(time: Array, before: Array, after: Array) -> Figure:
-    """What the equations of two rows lack, before and after the projection."""
+    """The residual of two rows of the equations, before and after the projection."""
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)
     rows = ("base force z [N]", "front_left_knee [N m]")
-    for column, (what, values) in enumerate({"K φ - Sᵀ τ": before, "V Vᵀ (K φ - Sᵀ τ)": after}.items()):
+    titles = ("before: foot forces are missing", "after projection: noise")
+    for column, (title, values) in enumerate(zip(titles, (before, after), strict=True)):
         for axis, name, series in zip(axes[:, column], rows, values, strict=True):
             axis.plot(time, series, color=(NOMINAL_COLOR, IDENTIFIED_COLOR)[column], linewidth=1.0)
-            axis.set_title(f"{what}: rms {np.sqrt(np.mean(series**2)):.3g}", loc="left")
+            axis.set_title(f"{title}, rms {np.sqrt(np.mean(series**2)):.3g}", loc="left")
             axis.set_ylabel(name)
             axis.set_xlim(0.0, time[-1])
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
-    return figure
-
-
-def ranks(run: Identification) -> dict[str, dict[str, int]]:
-    """Number of combinations of parameters that motion in some contact states determines, by sensors."""
-    robot, contacts = run.experiment.robot, run.experiment.contacts
-    return {
-        name: {
-            of: int(
-                np.linalg.matrix_rank(
-                    structural_problem(robot, contacts, torchid.named_sensors(of, robot.n, len(contacts)), states).A
-                )
-            )
-            for of in SENSORS
-        }
-        for name, states in STATES.items()
-    }
-
-
-def rank_figure(found: dict[str, dict[str, int]]) -> Figure:
-    """Bars of ranks, by contact states and sensors."""
-    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
-    axis = figure.subplots()
-    for number, (of, color) in enumerate(SENSORS.items()):
-        place = np.arange(len(found)) + 0.27 * (number - 1)
-        bars = axis.bar(place, [ranks[of] for ranks in found.values()], 0.25, color=color, label=f"sensors: {of}")
-        axis.bar_label(bars, fontsize=8)
-    axis.set_xticks(range(len(found)), list(found))
-    axis.set_ylabel("identifiable combinations [1]")
-    axis.grid(visible=False, axis="x")
-    figure.legend(loc="outside upper right", ncols=len(SENSORS))
     return figure
 
 

@@ -31,6 +31,20 @@ def test_as_many_intervals_hold_the_truth_as_the_page_says(demo_result: Identifi
     assert "24 of the 24 intervals hold it" in " ".join((ROOT / "docs" / "concepts.md").read_text().split())
 
 
+@pytest.mark.parametrize("feet", [("four", (0, 1, 2, 3)), ("two", (0, 3)), ("none", ())], ids=lambda feet: feet[0])
+def test_sensor_sets_determine_as_many_base_parameters_as_the_page_says(
+    demo_result: Identification, feet: tuple[str, tuple[int, ...]]
+) -> None:
+    robot, contacts = demo_result.experiment.robot, demo_result.experiment.contacts
+    state = tuple(number in feet[1] for number in range(len(contacts)))
+    ranks = []
+    for name in ("contacts", "joints", "full"):
+        sensors = torchid.named_sensors(name, robot.n, len(contacts))
+        ranks.append(np.linalg.matrix_rank(torchid.structural_problem(robot, contacts, sensors, [state]).A))
+    row = " | ".join(str(rank) for rank in ranks)
+    assert f"| {feet[0]} | {row} |" in (ROOT / "docs" / "concepts.md").read_text()
+
+
 def test_every_figure_of_the_page_is_there_and_is_drawn(
     demo_result: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -39,6 +53,6 @@ def test_every_figure_of_the_page_is_there_and_is_drawn(
     script("concept_figures").draw(tmp_path)
     assert files == [(DEMO / "quadruped.yaml", None)]
     drawn = {path.name for path in tmp_path.iterdir()}
-    assert len(drawn) == 4
+    assert len(drawn) == 3
     page = (ROOT / "docs" / "concepts.md").read_text()
     assert all(f"({name})" in page and (ROOT / "docs" / name).is_file() for name in drawn)
