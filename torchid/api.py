@@ -43,15 +43,14 @@ def identify(file: StrPath | None = None, /, *, resume: bool = False, **sections
         result["l_knee"].mass, result["l_knee"].standard_error.mass, result["l_knee"].verdict.mass
 
     Args:
-        file: experiment file; None: the keywords say all.
-        resume: go on with a training that was interrupted.
-        sections: by the keys of an experiment file and with its values, which they override as those of the command
-            line do; paths are relative to the working directory. With an `output` a run folder is written;
-            `output=None` writes nothing though the file names one.
+        file: experiment file; None if the keywords contain everything.
+        resume: continue an interrupted training.
+        sections: keys of an experiment file with their values. They override those of the file. Paths are relative to
+            the working directory. With an `output` a run folder is written; `output=None` writes nothing.
 
     Raises:
-        InputError: whatever does not fit; the message names the file, or the function where there is none.
-        BaseLostError: the sensors cannot see the base.
+        InputError: an input is wrong; the message names the file, or the function without a file.
+        BaseLostError: the sensors do not determine the motion of the base.
     """
     with _about("identify", file):
         return identify_settings(load_config(_path(file), (), sections), resume)
@@ -64,12 +63,12 @@ def evaluate(
 
     Args:
         run: result of `identify`, or its folder.
-        logs: one or several, or parts of them: "walk.npz[30:]".
-        device: where to compute; None: where the run did.
-        write: whether results go to RUN/evaluation, too.
+        logs: one or several logs, or parts of them: "walk.npz[30:]".
+        device: where to compute; None for the device of the run.
+        write: whether to write the results to RUN/evaluation too.
 
     Raises:
-        InputError: a folder that is no run, or a log that does not fit its robot.
+        InputError: the folder is not a run, or a log does not fit its robot.
     """
     paths = [Path(log) for log in ([logs] if isinstance(logs, (str, os.PathLike)) else logs)]
     with _about("evaluate", None):
@@ -86,11 +85,11 @@ def analyze(file: StrPath | None = None, /, **sections: Unpack[Sections]) -> Ana
     """Analyze what sensors and motion determine, and plan sensors, as `torchid analyze` does.
 
     Args:
-        file: experiment file; None: the keywords say all. Logs and sensors may be left out.
+        file: experiment file; None if the keywords contain everything. Logs and sensors are optional.
         sections: as for `identify`.
 
     Raises:
-        InputError: whatever does not fit.
+        InputError: an input is wrong.
     """
     with _about("analyze", file):
         return analyze_settings(load_analysis(_path(file), (), sections))

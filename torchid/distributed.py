@@ -1,8 +1,7 @@
 """Processes that share the work of one run through torch.distributed (the only module that imports it).
 
-All of them run the same program on the same files, and exchange what each has reduced its share of the samples to.
-There is one kind of exchange, in which every process hands over a value or the error that ends it: a failure of one
-reaches the others at their next exchange, whatever that is about.
+All processes run the same program on the same files, and exchange their reduced results. In each exchange a process
+sends a value, or the error that ended it. So a failure reaches the others at their next exchange.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ _STATUS = "status"
 
 
 class LostProcessError(TorchidError):
-    """Another process that shares the work has ended without a word."""
+    """Another process of the run has ended without an error message."""
 
 
 class ConnectionFailedError(TorchidError):
-    """The processes that torchrun has started do not reach each other."""
+    """The processes that torchrun started cannot connect to each other."""
 
 
 class _RemoteError(Exception):
@@ -48,7 +47,7 @@ class _RemoteError(Exception):
 
 
 class _Group:
-    """The processes of a group; `failed` once one has told of an error, `lost` once one has gone."""
+    """The processes of a group; `failed`: one has sent an error; `lost`: one has ended."""
 
     def __init__(self, group: ProcessGroup | None, rank: int, size: int) -> None:
         self.group = group
@@ -70,7 +69,7 @@ class _Group:
         if self.size == 1:
             return [value]
         if self.failed or self.lost:
-            raise LostProcessError("the processes of this run have parted; nothing more can be shared")
+            raise LostProcessError("another process of this run has failed; the processes no longer exchange results")
         import torch.distributed as dist
 
         out: list[Any] = [None] * self.size
@@ -79,7 +78,7 @@ class _Group:
         except RuntimeError as error:  # of the connection
             self.lost = True
             message = f"process {self.rank} of {self.size}: another process of this run has ended"
-            raise LostProcessError(f"{message}; nothing more can be shared") from error
+            raise LostProcessError(f"{message}. Start the run again") from error
         errors = [sent for what, sent in out if what == _FAILED]
         if errors:
             self.failed = True
@@ -88,7 +87,7 @@ class _Group:
             raise _received(*errors[0])
         if any(what != about for what, _ in out):
             self.lost = True
-            raise RuntimeError(f"processes differ in what they do: {', '.join(str(what) for what, _ in out)}")
+            raise RuntimeError(f"the processes are at different steps: {', '.join(str(what) for what, _ in out)}")
         return [sent for _, sent in out]
 
     def tell(self, error: Exception) -> None:
@@ -119,28 +118,28 @@ def is_first() -> bool:
 
 
 def all_gather(value: T, about: str) -> list[T]:
-    """The values of all processes, in their order, the same in each of them.
+    """Gather the values of all processes, in rank order.
 
     Args:
         value: of this process; anything that pickles.
-        about: what it is, for the message if processes disagree.
+        about: name of the value, for the message if processes disagree.
 
     Raises:
         LostProcessError: a process has ended.
-        Exception: whatever ended another process.
+        Exception: the error of another process.
     """
     return [value] if _sharing is None else _sharing.exchange(about, value)
 
 
 def from_first(compute: Callable[[], T], about: str) -> T:
-    """What a function returns in the first process, which alone calls it; all get its value, or its error.
+    """Call a function in the first process only; all processes get its value, or its error.
 
     Args:
-        compute: whose passes over samples that process makes alone.
+        compute: the function; passes over samples inside it are not shared.
         about: as for `all_gather`.
 
     Raises:
-        Exception: what `compute` raises.
+        Exception: the error of `compute`.
     """
     value = None
     if is_first():
@@ -151,25 +150,25 @@ def from_first(compute: Callable[[], T], about: str) -> T:
 
 
 def broadcast(value: T, about: str) -> T:
-    """The value of the first process, for decisions that rounding could turn on another machine.
+    """The value of the first process, for decisions that rounding could change on another machine.
 
     Args:
-        value: that of this process.
+        value: of this process.
         about: as for `all_gather`.
     """
     return all_gather(value, about)[0]
 
 
 def require_same(value: object, about: str) -> None:
-    """Make sure that all processes have the same, before they share work on it. Raises InputError: they have not."""
+    """Raise InputError if the processes have different values."""
     if any(other != value for other in all_gather(value, about)):
-        raise InputError("", about, "not the same in all processes", "the same files and settings on every machine")
+        raise InputError("", about, "differs between processes", "the same files and settings on every machine")
 
 
 def own_share(sizes: Sequence[int]) -> slice:
-    """The successive pieces, of these sizes, that this process works on; those of all processes are about equal.
+    """The contiguous pieces, of these sizes, that this process works on; all processes get about the same amount.
 
-    Successive, as pieces of one log and contact state reduce to one result.
+    Contiguous pieces of one log and contact state reduce to one result.
     """
     number = rank()
     count = world_size()
@@ -193,20 +192,20 @@ def apart() -> Iterator[None]:
 
 @contextmanager
 def share_work() -> Iterator[None]:
-    """Share passes over samples among the processes of the initialised `torch.distributed` group within the block.
+    """Share passes over samples between the processes of the initialised `torch.distributed` group.
 
-    Every process of the group enters the block and calls the same functions with the same arguments; each gets the
-    same results. Outside of the block nothing is shared, so that processes may call torchid on their own::
+    Every process enters the block and calls the same functions with the same arguments; each gets the same results.
+    Outside of the block nothing is shared::
 
         torch.distributed.init_process_group("gloo")
         with torchid.share_work():
             parts = torchid.compress_parts(logs, builder)
 
-    Without a group, or inside of another such block, the block is as any.
+    Without a group, or inside another such block, it has no effect.
 
     Raises:
         LostProcessError: another process has ended.
-        Exception: whatever ends the block of another process.
+        Exception: the error of another process.
     """
     global _sharing
     if _sharing is not None:
@@ -262,7 +261,7 @@ def join_launched() -> bool:
         attempt_store = dist.PrefixStore(_name_of_attempt(store, rank, size), store)  # type: ignore[attr-defined]
         dist.init_process_group("gloo", store=attempt_store, rank=rank, world_size=size, timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
-        raise ConnectionFailedError(f"the processes of this run do not reach each other ({error})") from error
+        raise ConnectionFailedError(f"the processes of this run cannot connect to each other ({error})") from error
     _launched = _Group(dist.group.WORLD, rank, size)
     return True
 

@@ -1,4 +1,4 @@
-"""Errors and warnings of torchid, each its own one-line message, and what of foreign text may stand in one."""
+"""Errors and warnings of torchid, each with a one-line message, and helpers for text in messages."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _UNPLAIN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 class TorchidError(Exception):
-    """Base of every error that torchid raises on purpose."""
+    """Base class of all errors that torchid raises on purpose."""
 
 
 class InputError(TorchidError, ValueError):
-    """Something a user supplied cannot be used.
+    """An input from the user cannot be used.
 
-    The message is one line: where it was found (a file or an argument; nothing if `source` is empty), which field, what
-    was found and what is accepted.
+    The message is one line: the source (file or argument; nothing if `source` is empty), the field, what was found and
+    what is accepted.
     """
 
     def __init__(self, source: object, field: str, reason: str, accepted: str) -> None:
@@ -36,16 +36,16 @@ class InputError(TorchidError, ValueError):
 
     @classmethod
     def at_field(cls: type[E], field: str, *rest: Any) -> E:
-        """The error at a field of `current_file`; `rest`: what follows the field in the arguments of the class."""
+        """The error at a field of `current_file`; `rest`: further arguments of the class."""
         return cls(current_file(), field, *rest)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Errors of worker processes, which may be about another file than their parent, reach it as they are."""
+        """Pickle errors of worker processes unchanged."""
         return type(self), (self.source, self.field, self.found, self.accepted)
 
 
 class UrdfError(InputError):
-    """A URDF that does not describe a tree of rigid bodies torchid can use."""
+    """A URDF that is not a tree of rigid bodies that torchid can use."""
 
 
 class LogError(InputError):
@@ -53,7 +53,7 @@ class LogError(InputError):
 
 
 class ConfigError(InputError):
-    """An experiment file or an override with an unknown key or an unusable value."""
+    """An experiment file or an override with an unknown key or a wrong value."""
 
 
 class SensorError(InputError):
@@ -61,14 +61,14 @@ class SensorError(InputError):
 
 
 class ImplausibleFitError(InputError):
-    """A fit that is impossible for any robot: the data, not the robot, are wrong."""
+    """A fit result that is impossible for any robot: the data are wrong."""
 
 
 class UnknownNameError(InputError, KeyError):
     """An unknown name; the message lists the nearest valid names."""
 
     def __init__(self, source: object, field: str, name: str, valid: Iterable[str], what: str = "") -> None:
-        """Take the name and the valid ones; `what` describes a name that is known, but not valid here."""
+        """Take the name and the valid names; `what` explains why a known name is not valid here."""
         self.name = name
         self.valid = tuple(valid)
         self.what = what
@@ -86,31 +86,31 @@ class BaseLostError(TorchidError):
 
 
 class TorchidWarning(UserWarning):
-    """Base of every warning that torchid gives on purpose."""
+    """Base class of all warnings of torchid."""
 
 
 class MasslessBodyWarning(TorchidWarning):
-    """A body that no child follows has no inertia; its inertial parameters stay out of the fit."""
+    """A body at the end of a limb has no inertia; its inertial parameters are not fitted."""
 
 
 class UnphysicalInertiaWarning(TorchidWarning):
-    """A link's or body's inertia belongs to no distribution of positive mass."""
+    """The inertia of a link or body is not physically consistent."""
 
 
 class BaseLostWarning(TorchidWarning):
-    """As BaseLostError, where the fit goes on (`sensors.on_base_lost: warn`)."""
+    """As BaseLostError, but the fit continues (`sensors.on_base_lost: warn`)."""
 
 
 class ConfoundedWarning(TorchidWarning):
-    """Parameters that are confounded with a sensor's offset or scale."""
+    """Parameters are confounded with a sensor's offset or scale."""
 
 
 class NumericalWarning(TorchidWarning):
-    """A result whose accuracy is limited by the conditioning of the problem."""
+    """The conditioning of the problem limits the accuracy of a result."""
 
 
 def warn(message: str, category: type[TorchidWarning] = TorchidWarning) -> None:
-    """Warn, as of the line outside of torchid that led here: that is the line that a user can change."""
+    """Warn at the line outside of torchid that called it: the line that a user can change."""
     frame = inspect.currentframe()
     level = 1
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == __package__:
@@ -120,12 +120,12 @@ def warn(message: str, category: type[TorchidWarning] = TorchidWarning) -> None:
 
 
 def warn_about_file(message: str, category: type[TorchidWarning] = TorchidWarning) -> None:
-    """As `warn`, the message with `current_file` before it, if there is one."""
+    """As `warn`, with `current_file` before the message."""
     warn(_prefixed(current_file(), message), category)
 
 
 def how_to_install(extra: str) -> str:
-    """How to install the packages of an extra; the name torchid on PyPI is not ours."""
+    """Command that installs an extra; the name torchid on PyPI belongs to another project."""
     return f"pip install '.[{extra}]' in the clone of torchid"
 
 
@@ -134,7 +134,7 @@ _file: ContextVar[str] = ContextVar("_file", default="")
 
 @contextmanager
 def about_file(file: object) -> Iterator[None]:
-    """Let errors and warnings within the block that name a field alone be about a field of this file."""
+    """Errors and warnings inside the block that name only a field are about this file."""
     token = _file.set(str(file))
     try:
         yield
@@ -143,13 +143,13 @@ def about_file(file: object) -> Iterator[None]:
 
 
 def current_file() -> str:
-    """The file that the innermost `about_file` names; empty outside of all."""
+    """File of the innermost `about_file`; "" outside."""
     return _file.get()
 
 
 @contextmanager
 def during(doing: str, source: object) -> Iterator[None]:
-    """As `about_file`; and let an error that leaves the block say what was being done to it: the innermost says it.
+    """As `about_file`; errors that leave the block also note the activity.
 
     Args:
         doing: such as "reading".
@@ -165,7 +165,7 @@ def during(doing: str, source: object) -> Iterator[None]:
 
 
 def activity_of(error: BaseException) -> str:
-    """What was being done when an error came up, as `during` noted; empty if it did not."""
+    """The activity that `during` noted for an error; "" without one."""
     return str(getattr(error, "_torchid_doing", ""))
 
 
@@ -192,7 +192,7 @@ def is_plain(text: str) -> bool:
 
 
 def excerpt(text: str, longest: int = 100) -> str:
-    """The text for use in a message: control characters escaped, the middle of a long text left out."""
+    """Short text for a message: control characters escaped, the middle of a long text removed."""
     if len(text) > longest:
         text = f"{text[: longest // 2]} ... {text[-longest // 4 :]} ({len(text)} characters)"
     return escape(text)
@@ -211,7 +211,7 @@ def one_line(text: str) -> str:
 
 
 class EscapedStream:
-    """A stream to a terminal that escapes control characters, which could move the cursor or hide text."""
+    """A terminal stream that escapes control characters, which could move the cursor or hide text."""
 
     def __init__(self, stream: Any) -> None:
         """Write to a stream, which `raw_stream` returns to code that escapes by itself."""
@@ -242,11 +242,11 @@ def join_names(names: Sequence[str], most: int = 4) -> str:
 
 
 def format_count(count: int, what: str) -> str:
-    """A number with its noun, as in "1 gap" and "3 gaps"."""
+    """A number with its noun, such as "1 gap" and "3 gaps"."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def format_percent(share: float, sign: str = "") -> str:
-    """A share in percent, to two digits or whole, as in "8.3", "83" and "830"; `sign`: "+" for that of gains, too."""
+    """A fraction in percent with two digits, such as "8.3", "83" and "830"; `sign` "+" also shows the sign of gains."""
     percent = 100.0 * share
     return f"{percent:{sign}.2g}" if abs(percent) < 99.5 else f"{percent:{sign}.0f}"

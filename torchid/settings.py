@@ -29,7 +29,7 @@ def _not_bool(value: object) -> object:
 
 def _has_name(value: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(value.get("name"), str):
-        raise ValueError("a mapping with the name of a class, and its options")
+        raise ValueError("a mapping with the name of a class and its options: {name: Adam, lr: 0.05}")
     return value
 
 
@@ -41,7 +41,7 @@ def _torch_device(value: str) -> str:
 
 def _file_name(value: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", value):
-        raise ValueError("a name of letters, digits, _, - and ., at most 100")
+        raise ValueError("a name of at most 100 letters, digits, _, - and .")
     return value
 
 

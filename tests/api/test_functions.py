@@ -200,7 +200,7 @@ def test_a_missing_keyword_is_named(result: torchid.Identification) -> None:
         torchid.evaluate(result, [])
     for device in ("tpu", "cuda:x", "cuda:99"):
         with pytest.raises(
-            ConfigError, match=f"^torchid.evaluate: device: '{device}' is not available here; accepted: c"
+            ConfigError, match=f"^torchid.evaluate: device: '{device}' is not available on this machine; acc"
         ):
             torchid.evaluate(result, DEMO / "sway_test.npz", device=device)
     with pytest.raises(ConfigError, match="^torchid.evaluate: write: True, of a run without a folder; accepted: run.w"):

@@ -110,7 +110,7 @@ def test_no_repr_is_longer_than_ten_lines(things: Mapping[str, object]) -> None:
         ("sensors", "12 joint torques"),
         ("rows", "RowBuilder: 4 contacts, 118 columns"),
         ("regressor", "13 bodies, 12 joints, 18 rows of K"),
-        ("problem", "for 156 parameters, 154 of them free"),
+        ("problem", "for 156 parameters (154 free)"),
         ("estimate", "Estimate: rank 118 of 156 parameters (79 identified, "),
         ("base parameters", "118 combinations of 154 free parameters"),
         ("batches", "MiniBatches: 1250 samples of 1 log"),

@@ -143,7 +143,7 @@ REFUSED = {
     "a kept sensor that is no candidate": ({"keep": ["knee"]}, "analysis.keep", "'knee'"),
     "an excluded sensor that is no candidate": ({"exclude": ["front_left_foot.fx"]}, "analysis.exclude", "foot.fx'"),
     "a sensor kept and excluded": (
-        {"keep": ["rear_left_knee"], "exclude": ["rear_left_knee"]}, "rear_left_knee", "one or the other",
+        {"keep": ["rear_left_knee"], "exclude": ["rear_left_knee"]}, "is also in exclude", "one of the two",
     ),
     "a candidate joint that does not exist": (
         {"candidates": {"joint_torques": ["knee"]}}, "analysis.candidates.joint_torques", "'knee'",

@@ -184,9 +184,7 @@ def test_machines_with_other_logs_are_told_apart(two_machines: tuple[Path, Path]
     status, _, complained = identified_on(two_machines)
     assert status != 0
     (line,) = lines_of_torchid(complained)
-    assert (
-        line == "torchid: logs: not the same in all processes; accepted: the same files and settings on every machine"
-    )
+    assert line == "torchid: logs: differs between processes; accepted: the same files and settings on every machine"
 
 
 @pytest.mark.study

@@ -126,9 +126,7 @@ def test_files_of_different_noise_or_of_the_same_log_are_refused(
     again = tmp_path / "again.factor"
     again.write_bytes(first.read_bytes())
     message = refusal([*experiment, f"logs.train=[{first}, {again}]"], fleet, capsys)
-    assert (
-        f"{again}: sha256: of the same log as {first} (sway_test.npz); accepted: factors of every log once" in message
-    )
+    assert f"{again}: sha256: same log as {first} (sway_test.npz); accepted: each log once" in message
 
 
 def changed_urdf(fleet: Path, folder: Path, change: Callable[[str], str]) -> str:

@@ -99,7 +99,7 @@ def test_a_converted_log_is_fitted_block_by_block_compressed_checked_and_judged(
 def test_plates_without_a_pose_in_their_world_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = recorded(tmp_path, "OpenSim", walk(2.0))
     file = experiment(tmp_path, MOTION, text, base_motion="contacts")
-    assert "contact_wrench_world: given, but preprocessing.base_motion: contacts knows no" in refusal(
+    assert "contact_wrench_world: preprocessing.base_motion: contacts does not know the heading" in refusal(
         ["identify", str(file)], tmp_path, capsys
     )
     with np.load(tmp_path / "motion.npz") as arrays:

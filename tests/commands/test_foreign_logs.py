@@ -151,4 +151,4 @@ def test_a_log_that_lacks_joints_of_the_robot_says_which(tmp_path: Path, capsys:
     columns["ignore"] = ["*"]
     file.write_text(yaml.safe_dump(settings, sort_keys=False))
     message = refusal(["identify", str(file)], tmp_path, capsys)
-    assert "joint_names: rear_left_knee of quadruped.urdf missing" in message
+    assert "joint_names: missing joints of quadruped.urdf: rear_left_knee" in message

@@ -146,7 +146,7 @@ def test_torques_of_no_robot_are_refused(tmp_path: Path, capsys: pytest.CaptureF
     rng = np.random.default_rng(0)
     demo_with(tmp_path / "demo", joint_torque=lambda torque: 50.0 * rng.normal(size=torque.shape))
     assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), f"output={tmp_path / 'run'}"]) == 2
-    assert "the fit leaves " in capsys.readouterr().err.splitlines()[-1]
+    assert "the fit does not explain " in capsys.readouterr().err.splitlines()[-1]
     assert not (tmp_path / "run").exists()
 
 

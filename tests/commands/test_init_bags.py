@@ -112,7 +112,7 @@ def test_a_go2s_orientation_lets_its_feet_roll_and_turned_frames_are_refused(tmp
     with pytest.raises(LogError, match=r"base_quat_xyzw: missing, though FL_foot \(radius 0.022 m\) rolls"):
         read[1][1].read(read[1][0].logs.train, None)
     turned = ["logs.topics.low_state.frame=radar"]
-    with pytest.raises(ConfigError, match=r"low_state\.frame: 'radar', which is turned by 165 deg against base"):
+    with pytest.raises(ConfigError, match=r"low_state\.frame: 'radar' is rotated by 165 deg relative to base"):
         set_up(load_config(tmp_path / "set.yaml", turned))
     set_up(load_config(tmp_path / "set.yaml", [*turned, "logs.topics.low_state.orientation=false"]))
 
@@ -204,11 +204,11 @@ def test_an_imu_turned_against_the_base_gives_it_no_orientation(tmp_path: Path) 
     settings = yaml.safe_load((tmp_path / "x.yaml").read_text())
     settings["logs"]["topics"]["imu"]["orientation"] = True
     (tmp_path / "y.yaml").write_text(yaml.safe_dump(settings))
-    with pytest.raises(ConfigError, match=r"imu\.frame: 'imu', which is turned by 90 deg against base_link"):
+    with pytest.raises(ConfigError, match=r"imu\.frame: 'imu' is rotated by 90 deg relative to base_link"):
         set_up(load_config(tmp_path / "y.yaml"))
     del settings["logs"]["topics"]["imu"]["frame"]
     (tmp_path / "y.yaml").write_text(yaml.safe_dump(settings))
-    with pytest.raises(ConfigError, match=r"logs\.topics\.imu\.frame: missing, with orientation: true"):
+    with pytest.raises(ConfigError, match=r"logs\.topics\.imu\.frame: missing with orientation: true"):
         set_up(load_config(tmp_path / "y.yaml"))
 
 

@@ -73,11 +73,11 @@ def test_a_known_total_mass_gives_the_scales_of_all_motors(
         ("estimator.total_mass=-1", "estimator.total_mass"),
         ("estimator.total_mass={value: 12, std: -1}", "estimator.total_mass.std"),
         ("estimator.masses={trnk: 3}", "estimator.masses: unknown name 'trnk'; accepted: trunk"),
-        ("estimator={masses: {trunk: 3}, frozen: [trunk]}", "estimator.masses.trunk: a mass of a body that is frozen"),
-        ("estimator={masses: {trunk: 3}, total_mass: 2}", "estimator.total_mass: 2 kg, of which trunk alone are 3 kg"),
+        ("estimator={masses: {trunk: 3}, frozen: [trunk]}", "estimator.masses.trunk: a mass, but the body is frozen"),
+        ("estimator={masses: {trunk: 3}, total_mass: 2}", "estimator.total_mass: 2 kg, but trunk alone weigh 3 kg"),
         (
             "estimator={name: consistent, masses: {trunk: 3}, bounds: {trunk: {m: [1, 4]}}}",
-            "estimator.masses.trunk: a mass, beside estimator.bounds.trunk.m; accepted: one of the two",
+            "estimator.masses.trunk: a mass, but estimator.bounds.trunk.m is also set; accepted: one of the two",
         ),
     ],
 )

@@ -77,7 +77,10 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None], samples: int
         (
             exchanged_legs,
             ["sensors.set=full", "sensors.noise={}", RIDGE],
-            ("the fit leaves ", "% of the joint torques; torchid check finds in train.npz: joint_torque: front and"),
+            (
+                "the fit does not explain ",
+                "% of the joint torques; torchid check finds in train.npz: joint_torque: front and",
+            ),
         ),
         (downward_world, ["sensors.set=joints", RIDGE], ("total mass is -", "opposite sign")),
         (in_degrees, ["sensors.set=joints", RIDGE], ("torchid check finds in train.npz: joint_position", "degrees")),

@@ -103,11 +103,11 @@ def test_runs_without_a_posterior_are_refused_with_advice(run: Path, tmp_path: P
     old = tmp_path / "old"
     shutil.copytree(run, old)
     (old / POSTERIOR).unlink()
-    with pytest.raises(torchid.TorchidError, match=r"no posterior\.npz in it; accepted: a run of this version"):
+    with pytest.raises(torchid.TorchidError, match=r"no posterior\.npz in it; accepted: a run folder of this version"):
         sample(old)
     with pytest.raises(ConfigError, match=r"no config\.yaml in it"):
         sample(tmp_path)
-    with pytest.raises(torchid.TorchidError, match="none: RUN: no such file or folder; accepted: a run of this"):
+    with pytest.raises(torchid.TorchidError, match="none: RUN: no such file or folder; accepted: a run folder of this"):
         torchid.PosteriorSampler(tmp_path / "none")
 
 

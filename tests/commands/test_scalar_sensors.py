@@ -62,18 +62,18 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("command", "override", "message"),
     [
         ("identify", "sensors=full", "contact_wrench: missing; accepted: contact_wrench_local or contact_wrench_"
-         "world, or contact_wrenches: {FRAME: [fn]} for the log's contact_force_normal"),
+         "world, or sensors.contact_wrenches: {FRAME: [fn]} to use contact_force_normal"),
         ("identify", f"sensors.contact_wrenches={{{FEET[0]}: [fn, fz]}}",
-         f"sensors.contact_wrenches.{FEET[0]}: 'fz' of a contact whose force is read along the ground's normal, 'fn'; "
-         "accepted: [fn] alone, or components of the wrench without it"),
+         f"sensors.contact_wrenches.{FEET[0]}: 'fz', but this sensor measures only 'fn'"
+         "; accepted: [fn], or wrench components without fn"),
         ("identify", "sensors.contact_wrenches={paw: [fn]}", "sensors.contact_wrenches: unknown name 'paw'"),
         ("analyze", "analysis.candidates.normal_forces=[paw]",
          "analysis.candidates.normal_forces: unknown name 'paw'; accepted: "),
         ("analyze", f"analysis.candidates={{contacts: axis, normal_forces: [{FEET[0]}]}}",
-         f"analysis.candidates.normal_forces: {FEET[0]}, beside single axes of the contacts' frames; accepted: "
+         f"analysis.candidates.normal_forces: {FEET[0]}, but candidates.contacts is axis; accepted: "
          "candidates.contacts: device or none"),
         ("analyze", "analysis.compare={left: {contact_wrenches: {front_left_foot: [fx]}}}",
-         "analysis.compare.left.contact_wrenches.front_left_foot: 'fx' of a contact whose force is read along"),
+         "analysis.compare.left.contact_wrenches.front_left_foot: 'fx', but this sensor measures only 'fn'"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_one_line(

@@ -113,4 +113,4 @@ def test_the_script_computes_where_it_is_told(tmp_path: Path) -> None:
         assert (status, told) == (0, "")
     else:
         assert status == 2
-        assert "device: 'cuda' is not available here; accepted: cpu, cuda, cuda:0, ..." in told
+        assert "device: 'cuda' is not available on this machine; accepted: cpu, cuda, cuda:0, ..." in told

@@ -44,7 +44,7 @@ def test_they_are_dropped_and_a_line_counts_them_by_contact(
         (line,) = said
         dropped = samples(tmp_path / "all") - samples(tmp_path / name)
         assert 25 <= dropped <= 60
-        assert f"{dropped} of {samples(tmp_path / 'all')} samples dropped, in which contacts slip: " in line
+        assert f"{dropped} of {samples(tmp_path / 'all')} samples dropped because contacts slip: " in line
         assert "front_left_foot in" in line
         assert line.count(" in ") == 2, "no other contact"
 

@@ -106,8 +106,8 @@ def test_thresholds_of_detection_are_checked(tmp_path: Path) -> None:
 
     field = "preprocessing.detect_contacts"
     assert "above touch (0.02)" in refused_detection({"lift": 0.1}, f"{field}.lift: 0.1")
-    refused_detection(True, f"{field}: set, without contacts", [])
-    refused_detection(True, f"{field}: set, though robot.fixed_base", fixed_base=True)
+    refused_detection(True, f"{field}: set, but contacts is empty", [])
+    refused_detection(True, f"{field}: set, but robot.fixed_base is true", fixed_base=True)
     place = f"{tmp_path / 'x.yaml'}: {field}"
     assert "touch" in refused_detection({"tuch": 0.1}, f"{place}: unknown name 'tuch'")
     refused_detection({"touch": -0.1}, f"{place}.touch: ")
@@ -197,8 +197,8 @@ def refused_settings(folder: Path, contacts: list[dict[str, Any]], **robot: Any)
 
 
 def test_contacts_that_can_never_say_how_the_base_stands_are_refused(tmp_path: Path) -> None:
-    assert "the experiment has none; accepted: three point feet" in refused_settings(tmp_path, [])
-    assert "the experiment has point front_left_foot, point" in refused_settings(tmp_path, FEET[:2])
+    assert "the contacts are none; accepted: three point feet" in refused_settings(tmp_path, [])
+    assert "the contacts are point front_left_foot, point" in refused_settings(tmp_path, FEET[:2])
     assert "robot.fixed_base is true" in refused_settings(tmp_path, FEET, fixed_base=True)
     set_up(load(tmp_path / "y.yaml", changed(
         robot={"urdf": str(DEMO / "quadruped.urdf")}, contacts=FEET[:3], preprocessing={"base_motion": "contacts"},

@@ -78,7 +78,9 @@ def test_a_fit_that_leaves_most_of_the_forces_is_refused_whether_or_not_a_mistak
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = of_random_torques()
-    with pytest.raises(ImplausibleFitError, match=r"the fit leaves .* of the weighted forces; accepted: data and URDF"):
+    with pytest.raises(
+        ImplausibleFitError, match=r"the fit does not explain .* of the weighted forces; accepted: data and URDF"
+    ):
         identified(log, tmp_path)
     band = Finding("dead band", SUSPICIOUS, "joint_torque", "reads 0", "switch the dead band off")
     late = Finding("delay", SUSPICIOUS, "joint_torque", "30 ms late", "shift them")

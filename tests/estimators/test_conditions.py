@@ -74,7 +74,7 @@ def test_a_body_that_is_no_mirror_image_is_found() -> None:
     assert violations(phi, scale, conditions) == []
     phi[1, 5] += 1e-3 * scale[1, 5]
     found = only(phi, conditions, scale)
-    assert (found.body, found.condition, found.unit) == (1, "no mirror image of body 0", "of its scale")
+    assert (found.body, found.condition, found.unit) == (1, "not the mirror image of body 0", "of its scale")
     assert found.amount == pytest.approx(1e-3)
 
 

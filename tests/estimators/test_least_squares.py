@@ -182,9 +182,12 @@ def test_what_rows_lack_is_no_share_of_the_data_and_part_of_the_standard_error(r
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"free": np.ones(12, dtype=np.int64)}, "free: found ndarray of int64; accepted: a NumPy array of bool"),
-        ({"A": torch.ones(20, 12)}, "A: found Tensor of torch.float32; accepted: a NumPy array of floats"),
-        ({"nominal": [0.0] * 12}, "nominal: found list of no dtype; accepted: a NumPy array of floats"),
+        (
+            {"free": np.ones(12, dtype=np.int64)},
+            r"free: found ndarray \(dtype int64\); accepted: a NumPy array of bool",
+        ),
+        ({"A": torch.ones(20, 12)}, r"A: found Tensor \(dtype torch.float32\); accepted: a NumPy array of floats"),
+        ({"nominal": [0.0] * 12}, r"nominal: found list \(dtype None\); accepted: a NumPy array of floats"),
     ],
 )
 def test_a_problem_of_other_types_is_refused_by_name(wrong: dict[str, Any], said: str) -> None:

@@ -97,7 +97,7 @@ def test_friction_of_zero_moves_only_to_a_mirror_image_or_a_bound() -> None:
 def test_distances_that_are_not_defined_are_refused() -> None:
     broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
     for arguments in ({"prior": "entropic"}, {"prior": "pullback"}, {"prior": "pullback", "nominal": broken}):
-        with pytest.raises(InputError, match=f"{arguments['prior']}, but the pseudo-inertia of body 0 "):
+        with pytest.raises(InputError, match=f"{arguments['prior']}, but the nominal pseudo-inertia of body 0 "):
             nearest_consistent(broken, SCALE, Conditions(), **arguments)
     assert (
         violations(nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD), SCALE, Conditions())
@@ -109,7 +109,7 @@ def test_distances_that_are_not_defined_are_refused() -> None:
     ("arguments", "message"),
     [
         ({"prior": "riemannian"}, "prior: found 'riemannian'; accepted: 'euclidean', 'pullback' or 'entropic'"),
-        ({"nominal": GOOD}, "nominal: found parameters for the euclidean prior"),
+        ({"nominal": GOOD}, "nominal: set, but the prior is 'euclidean'"),
         ({"prior": "pullback", "nominal": GOOD[:, :10]}, "nominal: found shape"),
     ],
 )

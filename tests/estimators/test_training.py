@@ -142,8 +142,8 @@ def test_a_descent_that_diverges_says_so_in_one_line_and_returns_no_parameters(b
     with pytest.raises(InputError) as raised:
         trainer.run()
     message = str(raised.value)
-    assert message.startswith("estimator: training: a loss of ")
-    assert message.endswith(f", with SGD at lr {rate:.3g}; accepted: a smaller lr")
+    assert message.startswith("estimator: training: diverged: loss ")
+    assert message.endswith(f" with SGD at lr {rate:.3g}; accepted: a smaller lr")
     assert "\n" not in message
 
 

@@ -183,7 +183,7 @@ def test_a_force_of_another_shape_is_refused_and_never_broadcast(force: Any, sha
 def test_a_force_that_is_not_finite_ends_the_descent(value: float) -> None:
     w = arm()
     trainer = Trainer(Sgd(epochs=1), w.problem, w.batches, residual=Fixed(lambda q, v, a: torch.full_like(v, value)))
-    with pytest.raises(InputError, match="training: a loss of (nan|inf) in epoch 1"):
+    with pytest.raises(InputError, match="training: diverged: loss (nan|inf) in epoch 1"):
         trainer.run()
 
 

@@ -107,7 +107,7 @@ def test_a_urdf_that_contradicts_its_own_shapes_is_warned_of(tmp_path: Path) -> 
     with pytest.warns(TorchidWarning) as caught:
         conditions(tmp_path, robot, com_inside="ellipsoid", com_shapes="collision")
     (message,) = (str(warning.message) for warning in caught)
-    assert message.startswith("experiment.yaml: estimator.com_inside: the URDF's own centre of mass is outside the")
+    assert message.startswith("experiment.yaml: estimator.com_inside: the centre of mass of the URDF is outside the")
     assert "ellipsoid at left_ankle_roll_link, right_ankle_roll_link; " in message
     assert conditions(tmp_path, robot, com_inside="ellipsoid").enclosures
 
@@ -125,13 +125,13 @@ def test_left_and_right_become_mirror_images(tmp_path: Path, biped: Robot) -> No
 
 
 @table({
-    "lower above upper": ({"torso": {"m": [2, 1]}}, "bounds.torso.m: 2 above 1; accepted: [lower, upper]"),
-    "frozen": ({"waist": {"m": [1, 2]}}, "bounds.waist.m: a bound on a body that is frozen"),
+    "lower above upper": ({"torso": {"m": [2, 1]}}, "bounds.torso.m: lower 2 is above upper 1; accepted: [lower, up"),
+    "frozen": ({"waist": {"m": [1, 2]}}, "bounds.waist.m: a bound, but the body is frozen"),
     "base's friction": ({"pelvis": {"fv": [0, 1]}}, "bounds.pelvis.fv: a bound on friction, but pelvis is the base"),
     "negative friction": ({"torso": {"fc": [-1, 1]}}, "bounds.torso.fc: [-1.0, 1.0]; accepted: bounds of at least 0"),
     "friction at most negative": ({"torso": {"fv": [None, -1]}}, "bounds.torso.fv: [None, -1.0]; accepted: bounds"),
-    "no mass": ({"torso": {"m": [None, 0]}}, "bounds.torso.m: at most 0; accepted: an upper bound above 0"),
-    "no inertia": ({"torso": {"Iyy": [None, -2]}}, "bounds.torso.Iyy: at most -2; accepted: an upper bound above 0"),
+    "no mass": ({"torso": {"m": [None, 0]}}, "bounds.torso.m: upper bound 0; accepted: an upper bound above 0"),
+    "no inertia": ({"torso": {"Iyy": [None, -2]}}, "bounds.torso.Iyy: upper bound -2; accepted: an upper bound"),
 })  # fmt: skip
 def test_bounds_that_nothing_meets_are_refused(case: tuple, tmp_path: Path, biped: Robot) -> None:
     bounds, found = case
@@ -140,7 +140,10 @@ def test_bounds_that_nothing_meets_are_refused(case: tuple, tmp_path: Path, bipe
 
 def test_bounds_on_what_is_not_fitted_are_refused(tmp_path: Path, biped: Robot) -> None:
     message = refusal(tmp_path, biped, bounds={"torso": {"fc": [0, 1]}}, friction=False)
-    assert message == "bounds.torso.fc: a bound on friction, which is not fitted; accepted: friction: true"
+    assert (
+        message
+        == "bounds.torso.fc: a bound on friction, but friction is not fitted; accepted: estimator.friction: true"
+    )
     robot = load(write(tmp_path, link("base"), link("ghost", ""), joint("a", "base", "ghost")))
     message = refusal(tmp_path, robot, bounds={"ghost": {"m": [0.1, 1]}})
     assert message.startswith("bounds.ghost.m: a bound, but ghost has no mass in the URDF")
@@ -169,9 +172,11 @@ def test_centres_of_mass_inside_nothing_are_refused(tmp_path: Path) -> None:
     robot = load(DEMO / "quadruped.urdf")
     with pytest.warns(TorchidWarning, match="no shapes at trunk, front_left_hip_link"):
         message = refusal(tmp_path, robot, com_inside="box")
-    assert message.startswith("com_inside: box, but quadruped.urdf says of no body that is fitted what shape it has")
+    assert message.startswith("com_inside: box, but no fitted body in quadruped.urdf has a shape")
     message = refusal(tmp_path, robot, com_shapes="collision")
-    assert message.startswith("com_shapes: collision, without com_inside; accepted: com_inside: box or ellipsoid")
+    assert message.startswith(
+        "com_shapes: collision, but com_inside is not set; accepted: com_inside: box or ellipsoid"
+    )
 
 
 # --------------------------------------------------------------------------------------------------------- whole runs
@@ -197,5 +202,12 @@ def test_all_conditions_hold_together_where_least_squares_breaks_each(kind: str,
     assert phi[:, 0].sum() == pytest.approx(2.5)
     plain = batch_estimator(replace(settings, name="least_squares"), wanted).solve(problem).phi
     broken = " ".join(found.condition for found in violations(plain.reshape(phi.shape), scale, wanted))
-    for word in (f"outside its {kind}", "no mirror image", "total mass", "m beyond its bounds", "fc beyond", "margin"):
+    for word in (
+        f"outside its {kind}",
+        "not the mirror image",
+        "total mass",
+        "m beyond its bounds",
+        "fc beyond",
+        "margin",
+    ):
         assert word in broken

@@ -91,5 +91,5 @@ def test_cross_validation_predicts_blocks_that_a_fit_has_not_seen(tmp_path: Path
     compared = torchid.calibrations(fit, robot, fitter.builder)
     assert compared.identified.calibrate(logs) == logs, "without offsets, readings are what they are"
     np.testing.assert_array_equal(compared.nominal.phi, robot.nominal.ravel())
-    with pytest.raises(LogError, match="too few to leave blocks"):
+    with pytest.raises(LogError, match="too few training samples to leave blocks out"):
         torchid.cross_validate([logs[0][:30]], fitter)

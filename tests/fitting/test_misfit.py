@@ -37,12 +37,12 @@ def test_a_model_explains_what_noise_would_leave_and_no_more() -> None:
     more = replace(good, residual=0.8, groups=(torque,))
     assert not more.explained
     assert str(more) == (
-        "residuals are 2.5 times what the stated noise leaves; most in joint_torque 0.4 N m where 0.16 are expected"
+        "residuals are 2.5 times as large as the stated noise; most in joint_torque 0.4 N m (expected 0.16)"
     )
     assert replace(more, expected=None).explained, "estimated noise is what the residuals show"
     alike = replace(good, expected=None, lack_of_fit=4.0)
     assert not alike.explained
-    assert str(alike) == "residuals are correlated in time, between blocks 4 times noise's variance"
+    assert str(alike) == "residuals are not white (their block variance is 4 times that of noise)"
     assert replace(alike, lack_of_fit=None).explained
     assert replace(alike, share=1e-7).explained, "what rounding leaves of exact signals"
     assert not replace(alike, share=1e-5).explained
@@ -50,7 +50,7 @@ def test_a_model_explains_what_noise_would_leave_and_no_more() -> None:
     unfitted = replace(good, friction=friction)
     assert not unfitted.explained
     assert str(unfitted) == (
-        "friction, which is not fitted, explains 40 times as much as it would of noise"
+        "friction, which is not fitted, explains 40 times as much as noise would"
         " (knee 0.1 N m and 0.02 N m s/rad, slide 3 N and -1 N s/m)"
     )
     assert replace(good, friction=replace(friction, ratio=1.9)).explained

@@ -180,5 +180,5 @@ def test_stated_noise_that_is_wrong_of_one_joint_is_named(arm: Arm) -> None:
 
 
 def test_a_number_for_each_joint_but_one_is_refused(arm: Arm) -> None:
-    with pytest.raises(InputError, match="joint_torque: 5 numbers; accepted: one for all joints, or 6"):
+    with pytest.raises(InputError, match="joint_torque: 5 numbers; accepted: 1 number for all joints, or 6"):
         arm.fit(arm.samples, SensorNoise(joint_torque=(0.1,) * 5))

@@ -73,10 +73,10 @@ def test_samples_are_as_wide_as_standard_errors_where_the_data_speak(run: torchi
     ("change", "complaint"),
     [
         ({"format": np.array(99)}, "another version"),
-        ({"A": np.zeros((3, 5))}, "A is no array"),
+        ({"A": np.zeros((3, 5))}, "A is not a number array"),
         ({"b": np.array([np.nan])}, "not finite"),
         ({"scale": np.zeros(156)}, "not positive"),
-        ({"mirror_bodies": np.array([[0, 99]])}, "no posterior"),
+        ({"mirror_bodies": np.array([[0, 99]])}, "not a posterior"),
         ({"nominal": None}, "nominal"),
     ],
 )

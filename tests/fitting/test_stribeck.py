@@ -86,7 +86,7 @@ def test_intervals_hold_the_velocity_of_noisy_logs() -> None:
 def test_coulomb_friction_alone_has_no_velocity(estimator: LeastSquares | Consistent) -> None:
     found = chosen(recorded(0.1, NOISE, at_rest=np.zeros(2)), 10.0, estimator=estimator)
     assert found.value is None
-    assert str(found).startswith("none: friction at rest is not significantly beyond Coulomb friction")
+    assert str(found).startswith("none: friction at rest is not significantly larger than Coulomb friction")
 
 
 def test_friction_at_rest_is_never_less_than_coulomb_friction_of_a_consistent_fit() -> None:

@@ -48,7 +48,7 @@ def test_the_radius_of_feet_is_found_where_they_are_balls(tmp_path: Path) -> Non
     assert choices.radius.value == pytest.approx(RADIUS_M, abs=2e-3)
     assert {contact.radius for contact in setup.contacts} == {choices.radius.value}
     assert {contact.radius for contact in setup.config.contacts} == {choices.radius.value}
-    assert f"ball of radius {1e3 * choices.radius.value:.3g} mm, by the logs" in setup.rolling
+    assert f"ball of radius {1e3 * choices.radius.value:.3g} mm, chosen from the logs" in setup.rolling
     model = row_model(setup, setup.builder(setup.sensors))  # what a file of factors keeps of it
     again = with_choices_of(model, set_up(load_config(experiment(tmp_path))))
     assert again.contacts == setup.contacts

@@ -524,6 +524,9 @@ def test_a_log_of_another_robot_is_not_usable_and_one_without_a_robot_says_what_
     assert finding.field == "joint_names"
     assert not renamed.usable
     feet = [Contact(name, "point") for name in demo_log().contact_names[:3]]
-    assert "active, but not among" in only(check(demo_log(), demo_robot(), feet, 8.0), "does not fit").found
+    assert (
+        "active, but not a contact of the experiment"
+        in only(check(demo_log(), demo_robot(), feet, 8.0), "does not fit").found
+    )
     reasons = {skip.name: skip.reason for skip in check(log).skipped}
     assert "no robot" in reasons["forces against the model"]

@@ -101,6 +101,6 @@ def test_the_base_of_another_frame_is_no_tilt() -> None:
     robot, _, log = skew_machine()
     quat = (Rotation.from_quat(value(log.base_quat_xyzw)) * Rotation.from_euler("x", 90, degrees=True)).as_quat()
     samples = bind_log(replace(log, base_quat_xyzw=quat), robot, CONTACTS)
-    with pytest.warns(match="is the base's orientation that of another frame"):
+    with pytest.warns(match="0.3 rad, the end of the search range. Is the base's orientation that of another frame"):
         choice = choose_base_tilt([samples], fitter_of(robot, "full"))
     assert max(np.abs(choice.value)) == LARGEST_TILT

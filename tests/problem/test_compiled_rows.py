@@ -219,7 +219,7 @@ def test_straight_knees_are_no_exception(
 def test_a_numba_that_does_not_work_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     builder = RowBuilder(QUADRUPED, POINTS, sensor_set("joints", QUADRUPED, POINTS))
     monkeypatch.setitem(sys.modules, "torchid.problem.compiled_rows", None)  # importing it then fails
-    with pytest.warns(torchid.errors.TorchidWarning, match="Numba: .*without it"):
+    with pytest.warns(torchid.errors.TorchidWarning, match=r"Numba does not load \(.* without it"):
         choose_kernels(builder, ENOUGH)
     assert builder.compiled is None
 

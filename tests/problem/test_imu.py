@@ -137,7 +137,7 @@ def refusal(log: Log, robot: Robot, kind: type[InputError] = LogError) -> str:
 def test_an_imu_on_a_moving_limb_is_refused_with_the_body_it_moves_with() -> None:
     robot, oracle, log = recorded()
     message = refusal(replace(with_imu(oracle, log, IMU), imu_frame="imu_in_torso"), robot)
-    assert "imu_frame: 'imu_in_torso', which moves with torso_link" in message
+    assert "imu_frame: 'imu_in_torso' is on torso_link, not on the base" in message
     assert "a frame on the base: pelvis" in message
 
 

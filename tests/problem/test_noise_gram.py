@@ -258,7 +258,7 @@ def test_no_more_is_taken_off_than_leaves_a_third(robot: Robot, builder: RowBuil
     R, noise = corrected.R, corrected.noise
     assert 0 < noise.lost <= noise.combinations
     assert noise.largest > 1.0 - LEAST_SIGNAL
-    assert "remain near the nominal ones" in str(noise)
+    assert "are mostly noise and stay near the nominal values" in str(noise)
     plain = factor.triangle().numpy()[:, :-1]
     U, values, Vh = np.linalg.svd(plain, full_matrices=False)
     kept = values > 1e-9 * values[0]

@@ -113,9 +113,14 @@ def test_fn_is_one_component_of_a_contact_and_alone() -> None:
         np.argwhere(sensors_of(mixed, {"LF_FOOT": ["fn"], "RF_FOOT": ["fx"]}).wrench), [[0, 2], [1, 0]]
     )
     for contacts, names in ((mixed, ["fn", "fz"]), (mixed, ["fz"]), (points, ["fz", "fn"])):
-        with pytest.raises(SensorError, match=r"sensors.contact_wrenches.LF_FOOT: 'fz' of .*; accepted: \[fn\] alone"):
+        with pytest.raises(
+            SensorError,
+            match=r"sensors.contact_wrenches.LF_FOOT: 'fz', but this sensor measures only 'fn'; accepted: \[fn\], or",
+        ):
             sensors_of(contacts, {"LF_FOOT": names})
-    with pytest.raises(SensorError, match="'fn' of a contact whose wrench is read; accepted: fx, fy, fz; .*along_norm"):
+    with pytest.raises(
+        SensorError, match="'fn', but this contact has a wrench sensor; accepted: fx, fy, fz; .*along_norm"
+    ):
         sensors_of(points, {"LF_FOOT": ["fn"]})
     with pytest.raises(UnknownNameError, match="sensors.contact_wrenches.LF_FOOT"):
         sensors_of(points, {"LF_FOOT": ["fm"]})
@@ -130,7 +135,7 @@ def test_what_is_missing_of_a_scalar_sensor_is_named() -> None:
     force = value(a_log().contact_force_normal).copy()
     force[10, 3] = np.nan
     found = message(a_log(contact_force_normal=force))
-    assert "contact_force_normal 'LF_FOOT': not a finite number at sample 8, while in contact" in found
+    assert "contact_force_normal 'LF_FOOT': not a finite number at sample 8, during contact" in found
     force[:] = np.where(value(a_log().contact_active), 1.0, np.nan)  # in the air nothing needs to have been read
     bind_log(preprocess(a_log(contact_force_normal=force)), robot, FEET, sensors)
     wrench = np.zeros((COUNT, 4, 6))
@@ -138,11 +143,11 @@ def test_what_is_missing_of_a_scalar_sensor_is_named() -> None:
         a_log(contact_force_normal=None, contact_wrench_local=wrench)
     )
     full = named_sensors("full", robot.n, 4)
-    assert "contact_force_normal 'LF_FOOT': no fx: the contact is read along the ground's normal" in message(
+    assert "contact_force_normal 'LF_FOOT': fx is not measured, only the force along the ground's normal" in message(
         a_log(), FEET, full
     )
     points = [replace(foot, along_normal=False) for foot in FEET]
-    hint = "accepted: contact_wrench_local or contact_wrench_world, or contact_wrenches: {FRAME: [fn]} for the log's"
+    hint = "accepted: contact_wrench_local or contact_wrench_world, or sensors.contact_wrenches: {FRAME: [fn]} to use"
     assert hint in message(a_log(), points, full)
     assert hint[:65] not in message(a_log(contact_force_normal=None), points, full).replace(hint[:64], "", 1)
 

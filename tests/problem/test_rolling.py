@@ -162,7 +162,7 @@ def test_what_rolls_needs_the_orientation_of_the_base() -> None:
         a_log(base_quat_xyzw=None, base_position_world=None, contact_normal_world=None, imu_frame="base", **imu)
     )
     message = refused(lambda: bind_log(log, load(ANYMAL), BALLS), "walk.npz: base_quat_xyzw: ", LogError)
-    assert "missing, though LF_FOOT (radius 0.04 m) rolls on ground that is known in the world" in message
+    assert "missing, but LF_FOOT (radius 0.04 m) needs the ground's normal in the base frame" in message
     assert "base_quat_wxyz or base_quat_xyzw beside the IMU, or radius: 0 for this contact" in message
     assert bind_log(log, load(ANYMAL), [replace(contact, radius=0.0) for contact in BALLS]).base.quat_xyzw is None
 
@@ -172,9 +172,15 @@ def test_what_rolls_needs_the_orientation_of_the_base() -> None:
     [
         ({"radius": -0.1}, "contact 'a': radius: -0.1; accepted: a number of at least 0"),
         ({"radius": float("nan")}, "contact 'a': radius: nan; accepted: a number of at least 0"),
-        ({"radius": 0.1, "kind": "flat"}, "contact 'a': radius: 0.1 of a flat contact; accepted: type point"),
-        ({"normal": (0.0, 0.0, 0.0)}, r"contact 'a': normal: \[0, 0, 0\]; accepted: three numbers, not all 0"),
-        ({"normal": (0.0, float("nan"), 0.0)}, r"contact 'a': normal: \[0, nan, 0\]; accepted: three numbers, not"),
+        ({"radius": 0.1, "kind": "flat"}, "contact 'a': radius: 0.1 for a flat contact; accepted: type point"),
+        (
+            {"normal": (0.0, 0.0, 0.0)},
+            r"contact 'a': normal: \[0, 0, 0\]; accepted: three numbers in the world, not all 0",
+        ),
+        (
+            {"normal": (0.0, float("nan"), 0.0)},
+            r"contact 'a': normal: \[0, nan, 0\]; accepted: three numbers in the world",
+        ),
     ],
 )
 def test_a_contact_that_cannot_be_is_refused(wrong: dict[str, Any], message: str) -> None:

@@ -224,7 +224,7 @@ def with_gap(case: Stance) -> Log:
 def test_nothing_is_differentiated_across_samples_with_too_few_feet(rates: tuple[float | None, float | None]) -> None:
     case = stance("quadruped")
     robot, contacts, log = robot_of(case.machine), case.contacts(), with_gap(case)
-    with pytest.warns(TorchidWarning, match=r"20 of 160 samples left out.* \(too few feet stand: 20\)") as caught:
+    with pytest.warns(TorchidWarning, match=r"20 of 160 samples dropped.* \(too few standing feet: 20\)") as caught:
         whole = with_pose(log, robot, contacts, *rates)
     assert len(caught) == 1
     assert not ((whole.time > log.time[69]) & (whole.time < log.time[90])).any()
@@ -241,7 +241,9 @@ def test_segments_too_short_for_the_filter_are_dropped_and_counted() -> None:
     case = stance("quadruped")
     robot, contacts = robot_of(case.machine), case.contacts()
     log = without(without(with_gap(case), 0, slice(100, 103)), 3, slice(100, 103))
-    with pytest.warns(TorchidWarning, match=r"33 of 160 .*feet stand: 23, segments too short to differentiate: 10"):
+    with pytest.warns(
+        TorchidWarning, match=r"33 of 160 .*few standing feet: 23, segments too short to differentiate: 10"
+    ):
         whole = with_pose(log, robot, contacts, 12.0)
     assert not ((whole.time > log.time[69]) & (whole.time < log.time[103])).any()
     with pytest.warns(TorchidWarning, match="23 of 160"):
@@ -268,7 +270,7 @@ def test_a_heading_that_is_lost_on_a_slope_ends_what_is_used() -> None:
     lifted = without(without(lifted, 0, slice(70, 90)), 1, slice(70, 90))
     standing = found(stance("humanoid", ASKEW), lifted)
     assert standing.segments == (slice(0, 70),)
-    assert standing.dropped == {"too few feet stand": 20, "heading on a floor that is not level": 70}
+    assert standing.dropped == {"too few standing feet": 20, "heading unknown on a sloped floor": 70}
     level = found(stance("humanoid"), lifted, stance("humanoid").contacts())
     assert level.segments == (slice(0, 70), slice(90, 160))
 
@@ -282,19 +284,27 @@ def test_a_log_that_says_nothing_of_the_base_is_refused_in_one_line() -> None:
     none = replace(log, contact_active=np.zeros_like(value(log.contact_active)))
     refused(lambda: found(case, none), "quadruped: contact_active: no contact stands in any sample", LogError)
     two = without(without(log, 0), 1)
-    refused(lambda: found(case, two), "quadruped: contact_active: at most 2 of the contacts stand at once", LogError)
+    refused(lambda: found(case, two), "quadruped: contact_active: at most 2 contacts at the same time", LogError)
     refused(lambda: found(case, replace(log, contact_active=None)), "quadruped: contact_active: missing", LogError)
     unnamed = replace(log, contact_names=("a", *log.contact_names[1:]))
     refused(lambda: found(case, unnamed), "quadruped: contact_names: contact 'front_left_foot' missing", LogError)
     fewer = replace(log, joint_names=log.joint_names[1:], joint_position=log.joint_position[:, 1:])
-    refused(lambda: found(case, fewer), "quadruped: joint_names: front_left_hip of", LogError)
+    refused(
+        lambda: found(case, fewer),
+        "quadruped: joint_names: missing joints of quadruped.urdf: front_left_hip;",
+        LogError,
+    )
     other = replace(log, joint_names=("knie", *log.joint_names[1:]))
     refused(lambda: found(case, other), "quadruped: joint_names: unknown name 'knie'", UnknownNameError)
     wrench = replace(log, contact_wrench_world=np.zeros((len(log), 4, 6)))
-    refused(lambda: found(case, wrench), "quadruped: contact_wrench_world: given", LogError)
+    refused(
+        lambda: found(case, wrench),
+        "quadruped: contact_wrench_world: preprocessing.base_motion: contacts does not know",
+        LogError,
+    )
     normals = np.tile(np.array(AHEAD), (len(log), 4, 1))
     tilted = replace(log, contact_normal_world=normals)
-    refused(lambda: found(case, tilted), "quadruped: contact_normal_world: other normals", LogError)
+    refused(lambda: found(case, tilted), "quadruped: contact_normal_world: differs from contacts[].normal", LogError)
     base_pose_from_feet(tilted, robot, tuple(replace(contact, normal=AHEAD) for contact in contacts))
 
 
@@ -306,10 +316,10 @@ def test_feet_in_a_line_say_nothing_of_the_tilt_about_it() -> None:
     straight = np.zeros_like(case.log.joint_position)
     bent = straight + (np.arange(len(straight)) >= 100)[:, None]
     log = replace(case.log, joint_position=straight, contact_names=leg, contact_active=active)
-    line = "quadruped: contact_active: the feet that stand are in a line"
+    line = "quadruped: contact_active: all standing feet are on one line"
     refused(lambda: found(case, log, contacts), line, LogError)
     standing = found(case, replace(log, joint_position=bent), contacts)
-    assert standing.dropped == {"feet in a line": 100}
+    assert standing.dropped == {"standing feet on one line": 100}
     assert standing.segments == (slice(100, 160),)
 
 
@@ -320,9 +330,9 @@ def test_a_sole_that_has_no_axis_towards_the_base_is_refused() -> None:
     lying = case.log.joint_position.copy()
     lying[:, names.index("left_ankle_pitch_joint")] += np.pi / 4.0
     message = refused(
-        lambda: found(case, replace(case.log, joint_position=lying)), "humanoid: contact_names: the base is"
+        lambda: found(case, replace(case.log, joint_position=lying)), "humanoid: contact_names: no axis of flat foot"
     )
-    assert "off the nearest axis of flat foot left_ankle_roll_link" in message
+    assert "no axis of flat foot left_ankle_roll_link points to the base" in message
 
 
 def test_feet_that_are_not_on_one_floor_are_warned_of() -> None:
@@ -330,7 +340,7 @@ def test_feet_that_are_not_on_one_floor_are_warned_of() -> None:
     robot, contacts = robot_of(case.machine), case.contacts()
     bent = case.log.joint_position.copy()
     bent[:, list(robot.joint_names).index("front_left_knee")] += 0.4
-    with pytest.warns(TorchidWarning, match=r"feet that stand are \d+ mm \(rms\) off one floor; check joint zeros"):
+    with pytest.warns(TorchidWarning, match=r"standing feet are \d+ mm \(rms\) off a common plane. Check joint zeros"):
         with_pose(replace(case.log, joint_position=bent), robot, contacts)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -105,7 +105,10 @@ def test_a_mistake_is_one_line(demo: Path, override: str, says: str, capsys: pyt
 def test_a_fixed_base_has_no_axes_to_weigh(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arm = ROOT / "configs" / "kuka_lwr4.yaml"
     assert main(["identify", str(arm), "estimator.task_weights={base_force: 2}", f"output={tmp_path / 'run'}"]) == 2
-    assert "estimator.task_weights: axes of the base, which is fixed; accepted: joint_torque" in capsys.readouterr().err
+    assert (
+        "estimator.task_weights: base_force or base_moment of a fixed base; accepted: joint_torque"
+        in capsys.readouterr().err
+    )
 
 
 def test_weights_of_a_bolted_arm_weigh_its_joints() -> None:

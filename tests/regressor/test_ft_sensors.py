@@ -147,7 +147,7 @@ def test_a_sensor_can_sit_at_a_fixed_joint_only(urdf: Path, name: str, what: str
     [
         ({"ft_names": (), "ft_wrench": None}, "ft_wrench: missing; accepted: the field, or "),
         ({"ft_wrench": None}, "ft_wrench: missing; accepted: the field, or "),
-        ({"ft_names": ("x", "y", *SENSORS[2:])}, f"ft_names: {SENSORS[0]}, {SENSORS[1]} missing; accepted: "),
+        ({"ft_names": ("x", "y", *SENSORS[2:])}, f"ft_names: missing sensors: {SENSORS[0]}, {SENSORS[1]}; accepted: "),
     ],
     ids=["not in the log", "no readings", "other names"],
 )
@@ -166,6 +166,6 @@ def test_one_reading_that_is_not_a_number_is_named_with_its_sensor_and_sample(ur
     assert log.ft_wrench is not None
     log.ft_wrench[3, log.ft_names.index("ankle_ft"), WRENCH_COMPONENTS.index("my")] = np.nan
     sensors = with_ft_sensors(named_sensors("joints", robot.n, 0, ft=len(SENSORS)), robot, ["ankle_ft"])
-    with pytest.raises(LogError, match=r"ft_wrench 'ankle_ft.my'.*sample 3 \(1 in all\)"):
+    with pytest.raises(LogError, match=r"ft_wrench 'ankle_ft.my'.*sample 3 \(in 1 sample\)"):
         bind_log(log, robot, (), sensors)
     bind_log(log, robot, (), named_sensors("joints", robot.n, 0, ft=len(SENSORS)))

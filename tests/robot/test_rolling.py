@@ -92,7 +92,9 @@ def test_what_the_file_states_counts_more_than_the_urdf(tmp_path: Path) -> None:
 
 def test_what_no_contact_can_have_is_refused_in_one_line(tmp_path: Path) -> None:
     robot = foot_on(tmp_path, shape('<sphere radius="0.04"/>'))
-    with pytest.raises(ConfigError, match=r"contacts\[0\].radius: 0.1 of a flat contact; accepted: type point \(a sph"):
+    with pytest.raises(
+        ConfigError, match=r"contacts\[0\].radius: 0.1 for a flat contact; accepted: type point \(a sph"
+    ):
         resolve_contacts([ContactConfig("foot", "flat", radius=0.1)], robot)
     with pytest.raises(ConfigError, match=r"contacts\[0\].centre: \[0, 0, 0.1\]; accepted: three numbers \[m\] in"):
         resolve_contacts([ContactConfig("foot", "flat", centre=[0.0, 0.0, 0.1])], robot)

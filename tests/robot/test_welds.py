@@ -103,5 +103,5 @@ def test_columns_of_welded_joints_are_left_out_and_those_that_move_are_named(tmp
     np.testing.assert_array_equal(bare.joint_torque, position[:, [1, 3]])
     assert joint_order(log, robot) == [3, 1]
     position[2, 0] = 0.11
-    with pytest.warns(TorchidWarning, match="'push' is up to 0.01 m away from 0.1 m"):
+    with pytest.warns(TorchidWarning, match="'push' is up to 0.01 m away from its welded 0.1 m"):
         without_welded_joints(log, robot)

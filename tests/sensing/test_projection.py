@@ -205,7 +205,7 @@ def test_a_part_of_a_batch_of_another_precision_or_none_is_refused_by_name(wrong
         "wrench": torch.ones(4, 3),
     }
     project = Projection([True] * 2, [False] * 3)
-    with pytest.raises(TypeError, match=f"^{wrong}: found torch.float64; accepted: torch.float32, as of K"):
+    with pytest.raises(TypeError, match=f"^{wrong}: found torch.float64; accepted: torch.float32, the dtype of K"):
         project(active=touching, **batch | {wrong: batch[wrong].double()})
     with pytest.raises(TypeError, match=f"^{wrong}: found NoneType; accepted: a tensor"):
         project(active=touching, **batch | {wrong: None})

@@ -42,7 +42,7 @@ def test_a_scalar_sensor_is_one_channel_named_and_priced_by_itself() -> None:
     with pytest.raises(UnknownNameError, match=r"candidates.normal_forces: unknown name 'left_foot'; accepted: left_"):
         candidates(robot, contacts, normal_forces=["left_foot"])
     with pytest.raises(
-        SensorError, match=r"normal_forces: left_ankle_roll_link, beside single axes .*: device or none"
+        SensorError, match=r"normal_forces: left_ankle_roll_link, but candidates.contacts is axis; .*: device or none"
     ):
         candidates(robot, contacts, per="axis", normal_forces=frames[:1])
 

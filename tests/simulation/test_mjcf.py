@@ -68,7 +68,7 @@ def test_armatures_are_in_the_torques_and_the_nominal_robot_keeps_them(tmp_path:
 
 
 def test_springs_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="a spring of stiffness 3; accepted: joints without springs"):
+    with pytest.raises(InputError, match="has a spring of stiffness 3; accepted: joints without springs"):
         set_up_simulation(of_mjcf(tmp_path, **{"joint ": '<joint stiffness="3" '}))
 
 

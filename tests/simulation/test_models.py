@@ -54,7 +54,7 @@ def test_links_that_cannot_exist_by_themselves_count_with_what_they_are_welded_t
 
 
 def test_a_link_that_moves_without_mass_is_named_with_what_helps() -> None:
-    line = r"romeo.urdf: link 'LFinger11Link': moves without mass .*robot.weld: {LHand: 0}"
+    line = r"romeo.urdf: link 'LFinger11Link': moves, but has no mass .*robot.weld: {LHand: 0}"
     with pytest.raises(UrdfError, match=line):
         compiled(ROMEO)
     joints = read_urdf(ROMEO)[1]

@@ -57,14 +57,17 @@ SETTINGS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "unknown foot with points": (feet(ONE_POINT, frames=("l_sol", "r_sole")), ("feet: unknown name 'l_sol'", "l_sole")),
     "foot that nothing touches": (
         feet(frames=("l_foot", "r_sole")),
-        ("sim.yaml: feet: no points, and biped.urdf has no collision spheres at l_foot", "points: [[x, y, z], ...]"),
+        (
+            "sim.yaml: feet: l_foot has no points here and no collision spheres in biped.urdf",
+            "points: [[x, y, z], ...]",
+        ),
     ),
     "no foot": ({"feet": []}, ("feet: an empty list",)),
     "posture of an unknown joint": (
         {"posture": {"l_nee_flexion": 1.0}},
         ("sim.yaml: posture: unknown name 'l_nee_flexion'; accepted: l_knee_flexion",),
     ),
-    "posture that does not stand": ({"posture": {"l_hip_flexion": -1.5}}, ("posture: l_sole is 86 degrees off",)),
+    "posture that does not stand": ({"posture": {"l_hip_flexion": -1.5}}, ("posture: l_sole is 86 deg off",)),
     "unknown wave": (wave("com_w", 0.1), ("motions.m.waves.0.what: unknown name 'com_w'", "com_x")),
     "unknown key of a wave": (wave("com_z", 0.1, hertz=1.0), ("motions.0.waves.0: unknown name 'hertz'", "hz")),
     "unknown foot to lift": (steps("r_sole", "l_foot"), ("motions.m.steps.order: unknown name 'l_foot'", "l_sole")),

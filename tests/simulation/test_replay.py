@@ -137,10 +137,10 @@ def test_windows_follow_each_other_and_none_has_a_gap(tmp_path: Path, length: fl
 def test_what_cannot_be_replayed_is_named(tmp_path: Path) -> None:
     true = arm(tmp_path)
     log = swinging(true)
-    assert "no 2 s without a gap" in refused(lambda: log.windows(2.0), "swing", LogError)
+    assert "no window of 2 s without a gap" in refused(lambda: log.windows(2.0), "swing", LogError)
     assert "2 sampling intervals" in refused(lambda: log.windows(1e-4), "swing", LogError)
     airborne = replace(log, angular_velocity=np.zeros((len(log.time), 3)))
-    assert "of a robot that stands" in refused(lambda: airborne.windows(0.1), "swing", LogError)
+    assert "with standing feet" in refused(lambda: airborne.windows(0.1), "swing", LogError)
     negative = model_of(true, armature=-0.01)
     assert "armature of first" in refused(
         lambda: replay_log(negative, log, (), log.windows(0.2), TIMES), str(tmp_path), InputError

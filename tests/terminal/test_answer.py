@@ -222,7 +222,7 @@ def test_a_fit_that_leaves_most_of_the_torques_is_not_explained_by_other_forces(
     found = replace(fitted, **errors, noise={**fitted.noise, group: noise}, limbs_in_air=in_air)
     experiment = consistent.experiment
     sensors = named_sensors(read, experiment.robot.n, len(experiment.contacts))
-    assert unexplained_torques(found, sensors) == "the fit leaves 70 % of the joint torques" * told
+    assert unexplained_torques(found, sensors) == "the fit does not explain 70 % of the joint torques" * told
 
 
 def test_bodies_that_are_heavy_without_data_are_named_together_with_a_ridge_that_was_not_tried(

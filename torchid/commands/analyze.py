@@ -94,11 +94,12 @@ class ScenarioAnalysis:
 
 @dataclass(frozen=True)
 class Analysis:
-    """Results by scenario, the accuracy of sensor sets on logs, and the folder that they were written to, if any.
+    """Results of an analysis by scenario, the accuracy of sensor sets on logs, and the output folder, if any.
 
-    Of processes that share the work, the first alone has the scenarios: to look for sensors is the work of one.
-    `resting`: share of the training logs' torques that count as unmeasured, as joints rest, if any does. `without`:
-    what leaving each sensor of the file out is worth to the prediction of the others, see `leave_sensors_out`.
+    Among processes that share the work, only the first has the scenarios.
+
+    `resting`: fraction of the training logs' torques that count as unmeasured because joints rest. `without`: gain in
+    predicting the other sensors when a sensor is left out, see `leave_sensors_out`.
     """
 
     setup: RobotSetup
@@ -119,7 +120,7 @@ class Analysis:
         return f"{self.setup.robot.path.name}; {'; '.join(chosen)}{sets}"
 
     def to_dict(self) -> dict[str, Any]:
-        """What `analysis.json` has."""
+        """Content of `analysis.json`."""
         names = self.setup.robot.body_names
         scenarios = {}
         for scenario in self.scenarios:

@@ -53,11 +53,11 @@ class CheckedLogs(list[Checked]):
 
     @property
     def usable(self) -> bool:
-        """Whether enough of every log may be fitted."""
+        """Whether every log has enough usable samples for a fit."""
         return all(log.usable for log in self)
 
     def to_dict(self) -> dict[str, Any]:
-        """What `torchid check --json` writes."""
+        """Output of `torchid check --json`."""
         return log_check_document(self)
 
     def __repr__(self) -> str:

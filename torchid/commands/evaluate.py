@@ -61,18 +61,18 @@ _TRACED = 10_000  # of a whole log: the rows of the fit take 0.1 ms each
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluatedRun:
-    """Errors of the parameters of a run on further logs.
+    """Errors of a run's parameters on further logs.
 
     Attributes:
-        metrics: errors of the nominal and of the identified parameters, by the name of a log.
-        excluded: rejected samples left out, by the name of a log.
-        forces: of the first samples of the first log, as measured and as predicted.
-        robot: whose they are.
-        at_rest: names of logs in which nothing moves.
-        usual: errors on the own logs of the run, by group of rows, the larger of train and test.
-        explained: whether the model explains the forces that the run was fitted to.
-        output: the folder that they were written to, if any.
-        with_residual: errors of joint torques with the learned module of the run, by the name of a log.
+        metrics: errors of the nominal and identified parameters, by log name.
+        excluded: number of rejected samples, by log name.
+        forces: measured and predicted forces of the first samples of the first log.
+        robot: of the run.
+        at_rest: names of logs without motion.
+        usual: errors on the run's own logs, by group of rows (the larger of train and test).
+        explained: whether the model explains the forces of the run.
+        output: output folder, if any.
+        with_residual: errors of joint torques with the run's learned module, by log name.
     """
 
     metrics: dict[str, Comparison[Metrics]]
@@ -88,7 +88,7 @@ class EvaluatedRun:
     __repr__ = short_repr
 
     def far_off(self) -> str | None:
-        """The log that is predicted far worse than the run's own were, in words, None without one."""
+        """Text about a log that is predicted much worse than the run's own logs; None without one."""
         ratios = {
             (name, group): error / self.usual[group]
             for name, pair in self.metrics.items()
@@ -113,7 +113,7 @@ class EvaluatedRun:
         return f"identified against {self.robot.format}; {'; '.join(texts)}"
 
     def to_dict(self) -> dict[str, dict[str, object]]:
-        """What `metrics.json` has, by name of a log."""
+        """Content of `metrics.json`, by log name."""
         document: dict[str, dict[str, object]] = {
             name: {
                 "identified": pair.identified.as_dict(),

@@ -140,13 +140,13 @@ class BodyVerdicts(_OfBody):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BodyEstimate(BodyValues):
-    """Identified parameters of one body, with the URDF's, standard errors and verdicts under the same names.
+    """Identified parameters of one body; nominal values, standard errors and verdicts have the same names.
 
     Attributes:
-        name: of the body, that of its link.
-        joint: that moves it, "" for the base.
-        nominal: the URDF's parameters.
-        standard_error: of the identified ones, NaN where the data do not determine them.
+        name: of the body (its link).
+        joint: the joint that moves it, "" for the base.
+        nominal: parameters of the URDF.
+        standard_error: of the identified values; NaN where the data do not determine them.
         verdict: how far the data determine them.
     """
 
@@ -158,7 +158,7 @@ class BodyEstimate(BodyValues):
 
     @property
     def center_of_mass(self) -> Array:
-        """In the link frame, (3,) [m]; NaN without mass."""
+        """Centre of mass in the link frame, (3,) [m]; NaN without mass."""
         return self.first_moment / self.mass if self.mass else np.full(3, np.nan)
 
     def __repr__(self) -> str:
@@ -198,9 +198,9 @@ def body_estimate(robot: Robot, estimate: Estimate, name: str) -> BodyEstimate:
 
 
 class ParameterTable(list[dict[str, Any]]):
-    """Rows of a table, one for each parameter of each body: mappings with the same keys, as `pandas.DataFrame` takes.
+    """Table with one row per parameter of each body: a list of mappings, as `pandas.DataFrame` takes it.
 
-    `print` shows all of it.
+    `print` shows the whole table.
     """
 
     def __str__(self) -> str:

@@ -74,7 +74,7 @@ _WRITTEN = "a folder that this version of torchid identify wrote"
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Identification(Results):
-    """A finished run; `run["l_knee"]` is what it says of a body, by its name or that of its joint.
+    """Result of `identify`; `run["l_knee"]` gives the estimate of a body, by its name or that of its joint.
 
     Its attributes are those of `torchid.commands.results.Results`.
     """
@@ -83,19 +83,19 @@ class Identification(Results):
         return "\n".join(summary_lines(self))
 
     def to_dict(self) -> dict[str, Any]:
-        """What a run folder has in `parameters.json`, `metrics.json` and `config.yaml`."""
+        """Content of `parameters.json`, `metrics.json` and `config.yaml` of a run folder."""
         parameters = parameters_document(self.experiment.robot, self.estimate, self.by_state, self.extras)
         config = yaml.safe_load(dump_config(self.experiment.config))
         return {"parameters": parameters, "metrics": _metrics_document(self), "config": config}
 
     def to_urdf(self, path: str | Path, overwrite: bool = False) -> Path:
-        """Write the URDF with the identified parameters; meshes keep their names.
+        """Write the URDF with the identified parameters; references to meshes do not change.
 
         Raises:
             ConfigError: the file exists and `overwrite` is not set, or it is an input.
 
         Warns:
-            TorchidWarning: bodies that cannot exist.
+            TorchidWarning: a body is not physically consistent.
         """
         inputs = inputs_of(self.experiment.config)
         check_free_file(path := Path(path), "path", overwrite, inputs, "overwrite=True")
@@ -104,10 +104,10 @@ class Identification(Results):
         return path
 
     def write(self, output: str | Path, overwrite: bool = False, learned: RigidPlusResidual | None = None) -> Path:
-        """Write the run folder that `torchid identify` writes, and what was learned beside, which `evaluate` takes up.
+        """Write the run folder of `torchid identify`; with `learned`, the residual module too, which `evaluate` uses.
 
         Raises:
-            ConfigError: the folder exists and may not be replaced.
+            ConfigError: the folder exists and must not be replaced.
         """
         check_free(path := Path(output).absolute(), overwrite, RUN, inputs_of(self.experiment.config))
         write_run(self, path, overwrite, learned=learned)

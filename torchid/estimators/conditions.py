@@ -20,10 +20,10 @@ _ROUNDING = 1e-6  # of matrices given with six digits
 
 @dataclass(frozen=True)
 class Enclosure:
-    """Where the centre of mass of a body lies: a box or an ellipsoid in its link's frame.
+    """Region for the centre of mass of a body: a box or an ellipsoid in its link frame.
 
-    `axes`, (3, 3), orthonormal: columns are the directions of `half`, (3,) [m], half edges or semi-axes; `centre`,
-    (3,) [m].
+    `axes`, (3, 3), orthonormal: columns are the directions of `half`, (3,) [m], half edges or semi-axes; `centre`, (3,)
+    [m].
     """
 
     body: int
@@ -45,9 +45,9 @@ class Enclosure:
 
 @dataclass(frozen=True)
 class Mirror:
-    """Two bodies that are mirror images, friction included, or one symmetric body.
+    """Two bodies that are mirror images (friction included), or one symmetric body.
 
-    `reflection`, (3, 3), orthogonal, maps vectors of the first link to the second's. Its determinant is -1, or 1 for
+    `reflection`, (3, 3), orthogonal, maps vectors of the first link to the second. Its determinant is -1, or 1 for
     equal bodies with rotated links.
     """
 
@@ -73,15 +73,15 @@ def _short(value: object) -> str:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions on the parameters (L, 12) of all bodies.
+    """Conditions of physical consistency on the parameters (L, 12) of all bodies.
 
     Attributes:
-        margin: least eigenvalue of every body's scaled pseudo-inertia, which is 1 kg, 1 m for a body of the nominal
-            mass and radius of gyration; above 0, some density of matter has the parameters.
-        total_mass: of all bodies [kg], None if unknown.
-        enclosures: of centres of mass.
-        mirrors: left and right.
-        lower, upper: bounds (L, 12), infinite where there are none; friction is never negative.
+        margin: smallest eigenvalue of every body's scaled pseudo-inertia. The scale is that of a body with the nominal
+            mass and radius of gyration. Above 0, a positive mass density with these parameters exists.
+        total_mass: of all bodies [kg]; None if unknown.
+        enclosures: regions for centres of mass.
+        mirrors: pairs of mirrored bodies.
+        lower, upper: bounds (L, 12), infinite for no bound. Friction is never negative.
         names: of the bodies, for messages; numbers if empty.
     """
 
@@ -96,7 +96,7 @@ class Conditions:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Check the numbers; `bounds` checks those by body."""
+        """Check the numbers; `bounds` checks the bounds of bodies."""
         validate_settings(self)
 
     def body_name(self, body: int) -> str:
@@ -104,11 +104,7 @@ class Conditions:
         return self.names[body] if self.names else f"body {body}"
 
     def validate_bodies(self, bodies: int) -> None:
-        """Refuse conditions on bodies that a robot with this many does not have.
-
-        Raises:
-            ValueError: names the body.
-        """
+        """Raise ValueError if a condition names a body that a robot with this many bodies does not have."""
         for body in [e.body for e in self.enclosures] + [b for m in self.mirrors for b in (m.body, m.image)]:
             if not 0 <= body < bodies:
                 raise ValueError(f"body: found {body}; accepted: 0 to {bodies - 1}")
@@ -121,9 +117,8 @@ class Conditions:
             if bound.shape != (bodies, PER_BODY):
                 raise ValueError(f"{name}: found shape {bound.shape}; accepted: ({bodies}, {PER_BODY})")
             if np.isnan(bound).any() or (bound == impossible).any():
-                raise ValueError(
-                    f"{name}: found NaN or {impossible}; accepted: numbers, {-impossible} where there is no bound"
-                )
+                accepted = f"numbers, {-impossible} for no bound"
+                raise ValueError(f"{name}: found NaN or {impossible}; accepted: {accepted}")
         lower[:, parameters.FRICTION] = np.maximum(lower[:, parameters.FRICTION], 0.0)
         return lower, upper
 
@@ -139,7 +134,7 @@ def mirror_matrix(reflection: Array) -> Array:
 
 @dataclass(frozen=True)
 class Violation:
-    """A condition that a body violates, or an actuator's term, and by how much, in the unit given."""
+    """A violated condition on a body or an actuator term; `amount` is in `unit`."""
 
     body: int | None
     condition: str
@@ -149,15 +144,11 @@ class Violation:
 
 
 def validate_parameters(**arrays: Array) -> None:
-    """Refuse arrays that are not of one shape (L, 12) or not finite, and an array named scale that is not positive.
-
-    Raises:
-        ValueError: names the array.
-    """
+    """Raise ValueError if arrays differ in shape (L, 12), are not finite, or if `scale` is not positive."""
     shape = (*next(iter(arrays.values())).shape[:1], PER_BODY)
     for name, array in arrays.items():
         if array.shape != shape or array.ndim != 2:
-            raise ValueError(f"{name}: found shape {array.shape}; accepted: (L, {PER_BODY}), the same for all")
+            raise ValueError(f"{name}: found shape {array.shape}; accepted: one shape (L, {PER_BODY}) for all")
         if not np.isfinite(array).all():
             raise ValueError(f"{name}: found a number that is not finite; accepted: finite numbers")
         if name == "scale" and not (array > 0.0).all():
@@ -165,7 +156,7 @@ def validate_parameters(**arrays: Array) -> None:
 
 
 def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float = 1e-9) -> list[Violation]:
-    """Conditions that parameters (L, 12) violate by more than `tolerance` of their `parameter_scale`, (L, 12)."""
+    """Conditions that parameters (L, 12) violate by more than `tolerance` times their `scale`, (L, 12)."""
     validate_parameters(phi=phi, scale=scale)
     conditions.validate_bodies(len(phi))
     out: list[Violation] = []
@@ -180,23 +171,23 @@ def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: floa
         image = mirror_matrix(mirror.reflection) @ phi[mirror.body]
         error = float(np.max(np.abs(image - phi[mirror.image]) / scale[mirror.image]))
         if error > tolerance:
-            condition = f"no mirror image of {conditions.body_name(mirror.body)}"
+            condition = f"not the mirror image of {conditions.body_name(mirror.body)}"
             out.append(Violation(mirror.image, condition, error, "of its scale"))
     if conditions.total_mass is not None:
         error = float(abs(phi[:, parameters.MASS].sum() - conditions.total_mass))
         if error > tolerance * conditions.total_mass:
-            out.append(Violation(None, "total mass is another", error, "kg"))
+            out.append(Violation(None, "total mass differs", error, "kg"))
     return out + _bound_violations(phi, scale, conditions, tolerance)
 
 
 def term_violations(problem: LinearProblem, phi: Array, psi: Array | None, tolerance: float = 1e-9) -> list[Violation]:
-    """Conditions on the terms of a problem that are violated by more than `tolerance` of their size.
+    """Conditions on the terms of a problem that are violated by more than `tolerance` times their size.
 
     Args:
         problem: with the terms.
         phi: (P,), parameters.
-        psi: (M,), terms; None for those that fit these parameters best.
-        tolerance: as above.
+        psi: (M,), terms; None for the best fit at these parameters.
+        tolerance: relative to the size.
     """
     terms = problem.terms
     if terms is None:
@@ -231,7 +222,7 @@ def _inertia_violations(body: int, phi: Array, scale: Array, margin: float, tole
     if a < -tolerance * size:
         out.append(Violation(body, "inertia about the centre of mass not positive", float(-a), "kg m^2"))
     if a + b - c < -tolerance * size:
-        out.append(Violation(body, "triangle inequality of the principal inertias", float(c - a - b), "kg m^2"))
+        out.append(Violation(body, "triangle inequality of principal inertias violated", float(c - a - b), "kg m^2"))
     least = float(np.linalg.eigvalsh(parameters.pseudo_inertia(phi / scale))[0])
     if least < margin - tolerance:
         out.append(Violation(body, f"pseudo-inertia below the margin of {margin:g}", margin - least, "scaled"))
@@ -239,7 +230,7 @@ def _inertia_violations(body: int, phi: Array, scale: Array, margin: float, tole
 
 
 def _excursion(phi: Array, enclosure: Enclosure) -> float:
-    """Distance of the centre of mass outside its enclosure, as a share of the half sizes; negative inside."""
+    """Distance of the centre of mass outside its enclosure, relative to the half sizes; negative inside."""
     com = phi[parameters.FIRST_MOMENT] / phi[parameters.MASS]
     local = np.abs(enclosure.axes.T @ (com - enclosure.centre)) / enclosure.half
     return float((local.max() if enclosure.kind == "box" else np.linalg.norm(local)) - 1.0)

@@ -197,6 +197,9 @@ class ConicProblem:
         return out
 
 
+_FEASIBLE = "conditions that can all be met together"
+
+
 def _reduced(rows: list[LinearCondition], count: int) -> tuple[Array, Array]:
     """Equalities on x (count,) as E x = e, in as few orthonormal rows as they have rank, and their right-hand sides.
 
@@ -210,8 +213,8 @@ def _reduced(rows: list[LinearCondition], count: int) -> tuple[Array, Array]:
     off = np.abs(e - U[:, kept] @ (U[:, kept].T @ e)) > EQUAL_WITHIN * (1.0 + np.abs(e).max(initial=0.0))
     if off.any():
         names = ", ".join(dict.fromkeys(row.name for row, wrong in zip(rows, off, strict=True) if wrong))
-        reason = "contradicts what is held fixed or the other equalities"
-        raise InputError("estimator", names, reason, "equalities that some parameters meet")
+        reason = "contradicts the fixed parameters or other equality constraints"
+        raise InputError("estimator", names, reason, _FEASIBLE)
     return right[kept], (U[:, kept].T @ e) / values[kept]
 
 
@@ -227,7 +230,7 @@ def _without_implied(rows: list[LinearCondition], E: Array, e: Array) -> list[Li
         if np.linalg.norm(row.row - E.T @ along) > EQUAL_WITHIN * np.linalg.norm(row.row):
             out.append(row)
         elif along @ e < row.bound - EQUAL_WITHIN * (1.0 + abs(row.bound)):
-            raise InputError("estimator", row.name, "excluded by equalities", "conditions that some robot can meet")
+            raise InputError("estimator", row.name, "contradicts the equality constraints", _FEASIBLE)
     return out
 
 
@@ -454,7 +457,7 @@ def _equalities(x: _Scaled, conditions: Conditions) -> list[LinearCondition]:
         most = upper[body, number]
         name = f"bounds of {parameters.PARAMETERS[number]} of {x.name(body)}"
         if least - most > EQUAL_WITHIN * scale[body, number]:
-            raise InputError("estimator", name, f"{least:g} above {most:g}", "a lower bound below the upper one")
+            raise InputError("estimator", name, f"lower {least:g} is above upper {most:g}", "lower below upper")
         out.append(x.condition(name, {(body, number): 1.0}, float(0.5 * (least + most) / scale[body, number])))
     return out
 
@@ -463,8 +466,8 @@ def _pseudo_inertia_root(scaled: Array, called: str, prior: Prior) -> Array:
     """L, (4, 4), of the pseudo-inertia J = L L^T of scaled parameters (12,)."""
     J = parameters.pseudo_inertia(scaled)
     if np.linalg.eigvalsh(J)[0] <= np.finfo(float).eps * np.trace(J):
-        reason = f"{prior}, but the pseudo-inertia of {called} that it is relative to is not positive definite"
-        raise InputError("estimator", "prior", reason, "euclidean, or physically consistent bodies")
+        reason = f"{prior}, but the nominal pseudo-inertia of {called} is not positive definite"
+        raise InputError("estimator", "prior", reason, "euclidean, or physically consistent nominal bodies")
     return np.asarray(np.linalg.cholesky(J))
 
 
@@ -513,7 +516,7 @@ def find_strictly_feasible(problem: ConicProblem) -> tuple[Array, int]:
         return z[:-1], steps
     which = int(slack.argmin())
     name = problem.names[which // 4 if which < 4 * len(problem.F0) else which - 3 * len(problem.F0)]
-    raise InputError("estimator", name, "excluded by the other conditions", "conditions that some robot can meet")
+    raise InputError("estimator", name, "contradicts the other conditions", _FEASIBLE)
 
 
 def _with_room(problem: ConicProblem, x: Array) -> Array:
@@ -629,8 +632,8 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
         if last or gap <= tolerance * scale:
             break
     if not best.gap <= max(_LOOSE, tolerance) * max(best.objective, problem.floor):
-        message = f"estimator: the barrier method stopped at a gap of {best.gap:.1g} to {best.objective:.3g}"
-        warn(message, NumericalWarning)
+        message = f"estimator: not converged (duality gap {best.gap:.1g}, objective {best.objective:.3g})"
+        warn(f"{message}. Set a larger estimator.ridge", NumericalWarning)
     return best
 
 
@@ -695,7 +698,7 @@ class PrimalDual:
         at = torch.from_numpy(x.copy())
         factors = self.factors(at)
         if factors is None:
-            raise np.linalg.LinAlgError("by rounding, the starting point is not strictly feasible")
+            raise np.linalg.LinAlgError("rounding made the starting point infeasible")
         kappa = max(self.problem.objective(x), self.problem.floor) / max(self.problem.degree, 1)
         Z = (self.weights + kappa)[:, None, None] * self.eye
         return self._point(at, factors, Z, kappa / factors[1])

@@ -1,4 +1,4 @@
-"""Physically consistent parameters: the estimator, and the consistent parameters nearest to any given ones."""
+"""The estimator of physically consistent parameters, and the consistent parameters nearest to given ones."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from torchid.rounding import relative_tolerance
 
 @dataclass(frozen=True, repr=False)
 class ConsistentEstimate(ConstrainedEstimate):
-    """An estimate that meets its conditions; with the entropic prior, `unconstrained` is None.
+    """An estimate that meets its conditions; `unconstrained` is None with the entropic prior.
 
     Attributes:
-        gap: to the dual objective; no parameters that meet the conditions have an objective lower by more.
+        gap: duality gap: no feasible parameters have an objective that is lower by more.
         steps: Newton steps.
-        active: names of the conditions that hold with equality, to within `AT_BOUND` of their scale.
+        active: names of the conditions that hold with equality, within `AT_BOUND` of their scale.
     """
 
     gap: float
@@ -35,18 +35,17 @@ class ConsistentEstimate(ConstrainedEstimate):
 
 @dataclass(frozen=True)
 class Consistent(Regularized):
-    """min ||A phi - b||^2 / rows + ridge * prior(phi) over all physically consistent phi.
+    """Physically consistent parameters: min ||A phi - b||^2 / rows + ridge * prior(phi) over all consistent phi.
 
-    `ridge` 0 is the least that is one numerically, 1e-14 of the largest eigenvalue of A^T A / rows in units of the
-    scale: parameters that the data do not determine stay nominal.
-
-    Parameters that are not free stay nominal, whether or not they meet the conditions (see `violations`); so do those
-    that neither rows nor conditions couple to others. The conditions are met strictly.
+    A `ridge` of 0 means the smallest ridge that matters numerically, 1e-14 of the largest eigenvalue of A^T A / rows in
+    scaled units. Parameters that the data do not determine then stay nominal. Parameters that are not free, or that
+    neither rows nor conditions couple to others, also stay nominal, even if they violate conditions (see `violations`).
+    All other conditions hold strictly.
 
     Attributes:
-        prior: "euclidean", ||(phi - nominal) / scale||^2; "pullback", sum of ||J_0^-1/2 (J - J_0) J_0^-1/2||^2 over
-            the bodies' pseudo-inertias J (Lee, Wensing, Park 2020); "entropic", sum of the log-det divergences
-            -log det(J_0^-1 J) + tr(J_0^-1 J) - 4 (Lee, Park 2018). The prior of friction is the first in any case.
+        prior: "euclidean": ||(phi - nominal) / scale||^2. "pullback": sum of ||J_0^-1/2 (J - J_0) J_0^-1/2||^2 over the
+            bodies' pseudo-inertias J (Lee, Wensing, Park 2020). "entropic": sum of the log-det divergences -log
+            det(J_0^-1 J) + tr(J_0^-1 J) - 4 (Lee, Park 2018). Friction always has the euclidean prior.
         conditions: on the parameters.
     """
 
@@ -60,12 +59,12 @@ class Consistent(Regularized):
     def solve(self, problem: LinearProblem) -> ConsistentEstimate:
         """Fit the free parameters.
 
-        Standard errors and ranks are those of least squares with the same ridge: conditions only narrow them.
+        Standard errors and ranks are those of least squares with the same ridge; conditions only reduce them.
 
         Raises:
-            InputError: the conditions exclude each other, or a prior other than the Euclidean one has nominal bodies
-                that are not physically consistent.
-            ValueError: columns that are not twelve for each body.
+            InputError: the conditions contradict each other, or the prior is not euclidean and a nominal body is not
+                physically consistent.
+            ValueError: the number of columns is not a multiple of 12.
         """
         problem.require_bodies()
         plain = self.least_squares.solve(problem)
@@ -85,7 +84,7 @@ class Consistent(Regularized):
     @report_rounding("consistent")
     @one_thread()
     def minimize(self, problem: LinearProblem) -> Minimizer:
-        """The parameters of `solve` alone, in four fifths of the time. Raises as `solve`."""
+        """As `solve`, without statistics; takes four fifths of the time."""
         return self._minimum(problem).minimizer
 
     def _minimum(self, problem: LinearProblem) -> _Minimum:
@@ -103,7 +102,7 @@ class Consistent(Regularized):
 
 @dataclass(frozen=True)
 class _Minimum:
-    """A minimizer, and the conic problem with its solution that it is from."""
+    """A minimizer, with its conic problem and solution."""
 
     minimizer: Minimizer
     conic: ConicProblem
@@ -111,7 +110,7 @@ class _Minimum:
 
 
 def _least_ridge(problem: LinearProblem) -> float:
-    """The ridge for 0, fifty roundings of the largest eigenvalue; all but 3 of 360 random fits resolve it."""
+    """The ridge used for 0: fifty rounding units of the largest eigenvalue; all but 3 of 360 random fits resolve it."""
     A = problem.A[:, problem.free] * problem.scale[problem.free]
     largest = float(np.linalg.norm(A, 2)) if A.size else 0.0
     return 1e-14 * largest**2 / max(problem.rows, 1) or 1.0
@@ -126,25 +125,25 @@ def nearest_consistent(
     prior: Prior = "euclidean",
     nominal: Array | None = None,
 ) -> Array:
-    """The physically consistent parameters nearest to given ones (Mistry, Schaal, Yamane 2009, III-B).
+    """Find the physically consistent parameters nearest to given ones (Mistry, Schaal, Yamane 2009, III-B).
 
-    Bodies without mass stay massless; friction of zero stays zero unless a bound or a mirror image requires more.
+    Bodies without mass stay massless. Friction of zero stays zero unless a bound or a mirror image requires more.
 
     Args:
         phi: (L, 12), physically consistent or not.
         scale: (L, 12), as in `parameter_scale`.
         conditions: to meet.
-        prior: the distance, as in `Consistent` with `phi` for the nominal parameters. "entropic" is defined only for a
-            `phi` whose bodies are physically consistent.
-        nominal: (L, 12), whose pseudo-inertias J_0 measure deviations for "pullback"; None for those of `phi`.
+        prior: distance, as in `Consistent` with `phi` as nominal parameters. "entropic" needs physically consistent
+            `phi`.
+        nominal: (L, 12), reference pseudo-inertias J_0 for "pullback"; None for those of `phi`.
 
     Raises:
-        InputError: the conditions exclude each other, or pseudo-inertias J_0 are not positive definite.
-        ValueError: shapes, or numbers that are not finite.
+        InputError: the conditions contradict each other, or pseudo-inertias J_0 are not positive definite.
+        ValueError: a shape is wrong, or a number is not finite.
     """
     Consistent(1.0, prior, conditions)  # checks the names
     if nominal is not None and prior != "pullback":
-        raise ValueError(f"nominal: found parameters for the {prior} prior; accepted: None, or prior 'pullback'")
+        raise ValueError(f"nominal: set, but the prior is '{prior}'; accepted: None, or prior='pullback'")
     validate_parameters(phi=phi, scale=scale, nominal=phi if nominal is None else nominal)
     free = _changeable(phi, conditions)
     nothing = np.zeros((0, phi.size))
@@ -179,15 +178,15 @@ def _solve(conic: ConicProblem, tolerance: float) -> Solution:
 
 
 def _with_decoupled_fixed(problem: LinearProblem, conditions: Conditions) -> LinearProblem:
-    """The problem with unobservable bodies and friction fixed whose nominal values are allowed.
+    """Fix the unobservable bodies and friction whose nominal values meet the conditions.
 
-    A solver ends within a tolerance of the least objective, which parameters that only a small ridge holds hardly
-    change: a KUKA's fixed base drifts by 8e-3 of its scale with a ridge of 1e-7. It also keeps away from conditions
-    that nothing pushes them to.
+    A solver ends within a tolerance of the least objective. Parameters that only a small ridge holds hardly change the
+    objective: a KUKA's fixed base drifts by 8e-3 of its scale with a ridge of 1e-7.
 
     Args:
-        problem: its parameters are those of bodies.
-        conditions: on the parameters. Bodies that one ties to others (the total mass, mirror images) stay as they are.
+        problem: with the parameters of bodies.
+        conditions: on the parameters. Bodies that a condition couples to others (total mass, mirror images) are not
+            fixed.
     """
     unobservable = (problem.free & ~_observable(problem)).reshape(-1, PER_BODY)
     if not unobservable.any():
@@ -205,7 +204,7 @@ def _with_decoupled_fixed(problem: LinearProblem, conditions: Conditions) -> Lin
 
 
 def _observable(problem: LinearProblem) -> np.ndarray:
-    """Parameters that rows, or terms that conditions bound, depend on, (P,) bool."""
+    """Parameters that rows, or terms with conditions, depend on, (P,) bool."""
     size = np.linalg.norm(problem.A, axis=0) * problem.scale
     seen = size > relative_tolerance(0.0, problem.A.shape) * size.max(initial=0.0)
     if problem.terms is not None:

@@ -32,29 +32,28 @@ _OBSERVABLE = 1e-12  # squared share in the row space: that of a finger in a sum
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated parameters, with the statistics that say how far to trust them.
+    """Estimated parameters with statistics of their reliability.
 
     Attributes:
-        phi: (P,) estimated parameters; those that were not free are nominal.
-        noise_error: (P,), standard errors if residuals are independent noise, NaN where the data do not determine the
-            parameter.
+        phi: (P,), estimated parameters; parameters that were not free are nominal.
+        noise_error: (P,), standard errors for independent residuals; NaN where the data do not determine the parameter.
         observable: (P,) bool, whether the data depend on the parameter at all.
         identifiable: (P,) bool, whether the data alone determine the parameter.
-        data_share: (P,), diagonal of the resolution matrix of the scaled problem with its Euclidean ridge: 1 where the
-            data alone determine the estimate, 0 where the nominal value does, NaN where the parameter was not free. It
-            needs no right-hand side.
+        data_share: (P,), diagonal of the resolution matrix of the scaled problem with its euclidean ridge: 1 if the
+            data alone determine the estimate, 0 if the nominal value does, NaN for fixed parameters. Independent of the
+            right-hand side.
         singular_values: of the scaled problem without its ridge, descending.
-        rank: of that problem.
-        condition_number: ratio of its largest singular value to the smallest that is not zero.
-        cost, nominal_cost: sum of squared whitened residuals at `phi` and at the nominal parameters.
+        rank: of the scaled problem without its ridge.
+        condition_number: largest singular value over the smallest non-zero one.
+        cost, nominal_cost: sums of squared whitened residuals at `phi` and at the nominal parameters.
         rows: number of scalar equations.
         oversampling: of the rows, as in `LinearProblem`.
-        block_error: (P,), standard errors by the scatter between blocks of the logs, see `Jackknife`; None where
-            there are too few.
-        kept_error: (P,), standard errors by what a ridge keeps of the error of the nominal parameters, which counts as
-            large where data do not determine it as where they do (`nominal_spread`); None without a ridge.
-        gain_error: (P,), standard errors by errors of the gain of the torque sensors; None where these do not count.
-        psi: (M,), values of the `terms` of the problem where conditions bound them, None where they are the best fit.
+        block_error: (P,), standard errors from the scatter between blocks of the logs, see `Jackknife`; None with too
+            few blocks.
+        kept_error: (P,), standard errors from the error of the nominal parameters that the ridge keeps, see
+            `nominal_spread`; None without a ridge.
+        gain_error: (P,), standard errors from gain errors of the torque sensors; or None.
+        psi: (M,), values of the problem's `terms` if conditions bound them; None for the best fit.
     """
 
     phi: Array
@@ -82,12 +81,12 @@ class Estimate:
 
     @property
     def standard_error(self) -> Array:
-        """The larger of `noise_error` and `block_error`, with `kept_error` and `gain_error`, (P,).
+        """The larger of `noise_error` and `block_error`, combined with `kept_error` and `gain_error`, (P,).
 
-        NaN where data do not determine it.
+        NaN where the data do not determine the parameter.
 
-        Source: by the mean squared error of a biased estimate 95 % of intervals hold the truth on average over
-        parameters (Nychka, Journal of the American Statistical Association 83, 1988, of smoothing splines).
+        Source: intervals from the mean squared error of a biased estimate cover the truth in 95 % of cases, on average
+        over parameters (Nychka, Journal of the American Statistical Association 83, 1988, on smoothing splines).
         """
         out = self.noise_error if self.block_error is None else np.maximum(self.noise_error, self.block_error)
         for more in (self.kept_error, self.gain_error):
@@ -101,11 +100,11 @@ class Estimate:
 
     @property
     def verdict(self) -> np.ndarray:
-        """One of `VERDICTS` for every parameter, (P,).
+        """Verdict on every parameter, one of `VERDICTS`, (P,).
 
-        "identified": the data determine it and have the larger share; "dominated by the prior": they determine it, but
-        the nominal value has the larger share; "only in combination": they determine only sums with other parameters,
-        however large their share; "unobservable": no row depends on it; "fixed": not free.
+        "identified": the data determine the parameter and dominate the prior. "dominated by the prior": the data
+        determine it, but the nominal value dominates. "only in combination": the data determine only sums with other
+        parameters. "unobservable": no row depends on it. "fixed": not free.
 
         Source: the three kinds of Atkeson, An, Hollerbach, IJRR 1986, and the prior.
         """
@@ -118,16 +117,17 @@ class Estimate:
 
 
 def residual_std(cost: float, rows: int, rank: int, oversampling: float) -> float:
-    """Standard deviation of whitened residuals whose noise fills 1/oversampling of the band.
+    """Standard deviation of whitened residuals whose noise fills 1/oversampling of the frequency band.
 
-    A fit of slow motions removes `oversampling` times the variance of one row for each independent parameter. A log so
-    short that no variance would remain must have motion outside the band; its rows count as independent but fewer.
+    A fit of slow motions removes `oversampling` times the variance of one row for each independent parameter. In a log
+    so short that no variance would remain, the motion extends beyond the band; its rows then count as independent but
+    fewer.
     """
     return float(np.sqrt(cost / max(rows - oversampling * rank, (rows - rank) / oversampling, 1.0)))
 
 
 class Minimizer(NamedTuple):
-    """What minimizes an estimator's objective: `phi` and `psi` of its `Estimate`, without any statistics."""
+    """Minimizer of an estimator's objective: `phi` and `psi` of its `Estimate`, without statistics."""
 
     phi: Array
     psi: Array | None = None
@@ -135,13 +135,13 @@ class Minimizer(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class ConstrainedEstimate(Estimate):
-    """An estimate under conditions, compared with the best one without.
+    """An estimate under conditions, compared with the unconstrained optimum.
 
     Attributes:
         objective: mean squared whitened residual plus prior.
-        unconstrained: the least objective without conditions; None where it is not known.
+        unconstrained: the least objective without conditions; None if unknown.
         distance: rms difference of the projected whitened forces from those of `LeastSquares` with the same ridge.
-        eigenvalues: (L,), smallest eigenvalue of every body's scaled pseudo-inertia, NaN for bodies without mass.
+        eigenvalues: (L,), smallest eigenvalue of every body's scaled pseudo-inertia; NaN for bodies without mass.
     """
 
     objective: float
@@ -156,12 +156,12 @@ class ConstrainedEstimate(Estimate):
 
     @property
     def relative_increase(self) -> float | None:
-        """The increase as a share of the unconstrained objective; None if that is unknown or 0."""
+        """The increase relative to the unconstrained objective; None if that is unknown or 0."""
         return None if self.increase is None or not self.unconstrained else self.increase / self.unconstrained
 
     @property
     def deviation(self) -> float:
-        """Distance from the least objective in standard errors by noise, rms over the determined combinations."""
+        """Distance from the unconstrained optimum in standard errors, rms over the determined combinations."""
         if self.increase is None or not self.unconstrained or not self.rank:
             return 0.0
         noise = residual_std(self.unconstrained * self.rows, self.rows, self.rank, self.oversampling)
@@ -171,34 +171,30 @@ class ConstrainedEstimate(Estimate):
 
 @contextmanager
 def report_rounding(estimator: str) -> Iterator[None]:
-    """Turn a failure of an estimator's linear algebra into an error that says what to change.
-
-    Raises:
-        InputError: a decomposition failed.
-    """
+    """Turn a failure of an estimator's linear algebra into an InputError that says what to change."""
     try:
         yield
     except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
         reason = f"{estimator} failed numerically ({error})"
-        accepted = "a larger ridge, fewer free parameters, or nominal bodies of plausible masses and sizes"
+        accepted = "a larger ridge, fewer free parameters, or nominal bodies with plausible masses and sizes"
         raise InputError("estimator", "name", reason, accepted) from error
 
 
 @dataclass(frozen=True)
 class Regularized:
-    """The settings that all estimators have.
+    """Settings of all estimators.
 
     Attributes:
-        ridge: weight of the prior, the squared deviation from the nominal parameters, against the mean squared whitened
+        ridge: weight of the prior (squared deviation from the nominal parameters) against the mean squared whitened
             residual.
-        rank_tolerance: a singular value of the scaled problem below this share of the largest counts as zero.
+        rank_tolerance: singular values of the scaled problem below this fraction of the largest count as zero.
     """
 
     ridge: NotNegative = 0.0
     rank_tolerance: Tolerance = field(default=RANK_TOLERANCE, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Check the settings. Raises ValueError: names the first that is not accepted."""
+        """Check the settings; ValueError names the first wrong one."""
         validate_settings(self)
 
     @property
@@ -209,16 +205,17 @@ class Regularized:
 
 @dataclass(frozen=True)
 class LeastSquares(Regularized):
-    """min ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2.
+    """Least squares with the nominal parameters as prior.
 
-    With `ridge` 0 the minimizer whose scaled deviation from the nominal parameters has the least norm. Solved by
-    `torch.linalg.lstsq` with LAPACK's gelsd, whose rank and singular values the estimate has; a ridge is P more rows.
+    Minimizes ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2. With `ridge` 0 the result is the minimizer
+    whose scaled deviation from the nominal parameters has the least norm. Solved by `torch.linalg.lstsq` (LAPACK
+    gelsd), with P more rows for a ridge.
     """
 
     @report_rounding("least_squares")
     @one_thread()
     def minimize(self, problem: LinearProblem) -> Minimizer:
-        """The parameters of `solve` alone.
+        """As `solve`, without statistics.
 
         Raises:
             InputError: a decomposition failed.
@@ -228,7 +225,7 @@ class LeastSquares(Regularized):
     @report_rounding("least_squares")
     @one_thread()
     def minimize_all(self, problem: LinearProblem, ridges: Sequence[float]) -> Array:
-        """The parameters with each of K ridges, (K, P), by one batch of least-squares problems.
+        """Parameters for each of K ridges, (K, P), by one batch of least-squares problems.
 
         Raises:
             InputError: a decomposition failed.
@@ -240,7 +237,7 @@ class LeastSquares(Regularized):
         return phi
 
     def _inverse(self, problem: LinearProblem) -> _Inverse:
-        """Of the free, scaled columns, which all ridges have in common."""
+        """Pseudoinverse of the free, scaled columns; all ridges share it."""
         key = "inverse", self.rank_tolerance
         return problem.shared(key, lambda: _Inverse.of(problem, self.rank_tolerance))
 
@@ -249,10 +246,10 @@ class LeastSquares(Regularized):
     def solve(self, problem: LinearProblem) -> Estimate:
         """Fit the free parameters.
 
-        Standard errors, `noise_error`, propagate the sensor noise, scaled to the observed residual, through the
-        estimator, and count only as many rows as the filtered noise leaves independent. Of the prior's bias they
-        contain what `shrinkage` of the problem says; `kept_error` has that of a ridge. They are NaN where the data
-        alone do not determine the parameter.
+        Standard errors (`noise_error`) propagate the sensor noise, scaled to the observed residual, through the
+        estimator. They count only independent rows. The prior's bias is included as far as `shrinkage` of the problem
+        describes it; `kept_error` has that of the ridge. They are NaN where the data alone do not determine the
+        parameter.
 
         Raises:
             InputError: a decomposition failed.
@@ -305,9 +302,9 @@ class LeastSquares(Regularized):
 
 @dataclass(frozen=True)
 class _Inverse:
-    """What `torch.linalg.lstsq` says of columns A, (R, P): their pseudoinverse, singular values and numerical rank.
+    """Pseudoinverse, singular values and numerical rank of columns A, (R, P), by `torch.linalg.lstsq`.
 
-    `row_space`: (P, P), the projector to what the rows determine.
+    `row_space`: (P, P), projector to the combinations that the rows determine.
     """
 
     A: Tensor
@@ -326,9 +323,9 @@ class _Inverse:
         return cls(A, solved.solution, solved.solution @ A, solved.singular_values, int(solved.rank))
 
     def solve(self, weights: Array, B: Tensor) -> Tensor:
-        """Minimizers X of ||A X - B||^2 + weight ||X||^2 for each of K weights, (K, P, M), of least norm for 0.
+        """Minimizers X of ||A X - B||^2 + weight ||X||^2 for each of K weights, (K, P, M), of least norm for weight 0.
 
-        A weight stands in P more rows, below those of A that its numerical rank leaves.
+        A weight adds P rows below those of A.
         """
         out = (self.pseudoinverse @ B).repeat(len(weights), 1, 1)
         damped = np.flatnonzero(weights)

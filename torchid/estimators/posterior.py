@@ -1,4 +1,4 @@
-"""What a fit and a prior leave open, a Gaussian within conditions; how wide the prior is by the data."""
+"""Posterior of a fit: a Gaussian within conditions; and the width of the prior estimated from the data."""
 
 from __future__ import annotations
 
@@ -28,15 +28,17 @@ _THINNEST = 1e-4  # least eigenvalue of the scaled pseudo-inertias that the prio
 
 @dataclass(frozen=True)
 class Posterior:
-    """exp(-||A phi + D psi - b||^2 / 2) times a prior, within conditions on phi, and psi at least `extra_lower`.
+    """Density exp(-||A phi + D psi - b||^2 / 2) times a prior, within conditions on phi and psi >= `extra_lower`.
 
     Attributes:
-        A: (R, 12 L), of the parameters phi; D: (R, S), of extra ones psi; b: (R,). Rows have noise of unit variance.
-        nominal, scale: (12 L,), where the prior is centred, and units of the parameters.
-        free: (12 L,) bool; the others stay nominal.
-        conditions: that parameters meet.
-        extra_size: (S,), standard deviation of the extra parameters by the prior, whose mean is 0.
-        extra_lower: (S,), 0 for extra parameters that are never negative, minus infinity for others.
+        A: (R, 12 L), of the parameters phi. Rows have unit noise variance.
+        D: (R, S), of the extra parameters psi.
+        b: (R,).
+        nominal, scale: (12 L,), mean of the prior, and units of the parameters.
+        free: (12 L,) bool; the other parameters stay nominal.
+        conditions: on the parameters.
+        extra_size: (S,), prior standard deviation of the extra parameters (mean 0).
+        extra_lower: (S,), 0 for extra parameters that are never negative, else minus infinity.
     """
 
     A: Array
@@ -53,15 +55,15 @@ class Posterior:
 
     @one_thread()
     def conic_problem(self, prior_error: float = PRIOR_ERROR) -> ConicProblem:
-        """The problem whose density exp(-objective / 2), within its conditions, is the posterior's.
+        """Conic problem with the density exp(-objective / 2) of the posterior.
 
-        Its variables are those of the free parameters (see `build_conic_problem`), and then the extra parameters in
-        units of their size. The prior is the pull-back one (Lee, Wensing, Park 2020): J_0^-1/2 (J - J_0) J_0^-1/2 of
-        each body's pseudo-inertia has entries of standard deviation `prior_error`, and friction one of that share of
-        its scale, 1 N m and 1 N m s/rad or more.
+        Its variables are those of the free parameters (see `build_conic_problem`), then the extra parameters in units
+        of their size. The prior is the pull-back one (Lee, Wensing, Park 2020): the entries of J_0^-1/2 (J - J_0)
+        J_0^-1/2 of each body's pseudo-inertia have the standard deviation `prior_error`. Friction has the same fraction
+        of its scale, at least 1 N m and 1 N m s/rad.
 
         Raises:
-            InputError: the conditions exclude each other.
+            InputError: the conditions contradict each other.
         """
         count = len(self.nominal)
         extras = len(self.extra_size)
@@ -86,24 +88,25 @@ class Posterior:
         return replace(conic, root=triangle[:size, :size], target=triangle[:size, size], constant=constant)
 
     def owners(self) -> np.ndarray:
-        """The body that each variable of the conic problem belongs to, (n,) int; extra parameters are on their own."""
+        """Body of each variable of the conic problem, (n,) int; each extra parameter has its own number."""
         of_extras = len(self.nominal) // PER_BODY + np.arange(len(self.extra_size))
         return np.concatenate([np.flatnonzero(self.free) // PER_BODY, of_extras])
 
     @property
     def _thinnest(self) -> float:
-        """Least eigenvalue of scaled pseudo-inertias that the prior is relative to."""
+        """Smallest eigenvalue of scaled pseudo-inertias that the prior refers to."""
         return max(_THINNEST, 2.0 * self.conditions.margin)
 
     def thin_bodies(self) -> np.ndarray:
-        """Whether bodies are rods, plates or points in the file, of which errors across are large shares, (L,)."""
+        """Whether bodies are rods, plates or points in the file, (L,): errors across them are large."""
         free = self.free.reshape(-1, PER_BODY)[:, parameters.INERTIAL].any(axis=1)
         return np.asarray(free & (parameters.least_eigenvalues(self.nominal, self.scale) < self._thinnest))
 
     def _metric(self) -> Array:
-        """Parameters (12 L,) whose pseudo-inertias the prior is relative to: the nominal ones, none of them singular.
+        """Parameters (12 L,) whose pseudo-inertias the prior refers to: the nominal ones, made positive definite.
 
-        Bodies that cannot exist, or are thinner than the conditions allow, have their least eigenvalues raised.
+        Physically inconsistent bodies, and bodies thinner than the conditions allow, have their smallest eigenvalues
+        raised.
         """
         scaled = (self.nominal / self.scale).reshape(-1, PER_BODY)
         values, vectors = np.linalg.eigh(parameters.pseudo_inertia(scaled))
@@ -199,8 +202,8 @@ class NominalError:
     def __str__(self) -> str:
         times = self.value / self.prior
         percent, factor = (f"{x:.0f}" if x > 99.0 else f"{x:.2g}" for x in (100.0 * self.value, times))
-        prior = f"{factor} times the {100.0 * self.prior:.3g} % of the prior"
-        return f"bodies are off the robot file by {percent} % where the data determine them, {prior}"
+        prior = f"{factor} times the prior's {100.0 * self.prior:.3g} %"
+        return f"the bodies that the data determine differ from the robot file by {percent} %, {prior}"
 
 
 @one_thread()

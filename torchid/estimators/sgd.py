@@ -1,4 +1,4 @@
-"""Mini-batch descent: optimizers, learnable parameters, settings, and what meets the conditions at its end."""
+"""Mini-batch descent: optimizers, learnable parameters, settings, and the final step that meets the conditions."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ Gradients are then not clipped.
 
 
 def optimizer_names() -> list[str]:
-    """Names of the classes in `torch.optim` that are supported: those in `OPTIMIZERS` that this torch has."""
+    """Names of the supported optimizers of `torch.optim`."""
     return sorted(name for name in _classes(torch.optim, Optimizer) if name in OPTIMIZERS)
 
 
@@ -78,24 +78,22 @@ def schedule_names() -> list[str]:
 
 
 def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimizer:
-    """An optimizer of parameter groups.
+    """Make an optimizer for parameter groups.
 
     Args:
-        chosen: its name, and options; those that are not given are as in `OPTIMIZERS`.
-        groups: of parameters, as torch takes them.
+        chosen: name and options; missing options are those of `OPTIMIZERS`.
+        groups: parameter groups, as torch takes them.
 
     Raises:
-        UnknownNameError: no class of `torch.optim`, or one that is not supported.
-        InputError: an option it does not take.
+        UnknownNameError: `torch.optim` has no such class.
+        InputError: the class is not supported, or does not take an option.
     """
     name, cls, options = _class_and_options(chosen, torch.optim, Optimizer, "optimizer", optimizer_names())
     if name not in OPTIMIZERS:
         raise InputError("estimator", f"optimizer {name}", "not supported", ", ".join(optimizer_names()))
     if name == "LBFGS" and len(groups) > 1:  # it takes one group
         if any("lr" in group for group in groups):
-            raise InputError(
-                "estimator", "residual_lr", "set, but LBFGS has one lr for all", "None, or another optimizer"
-            )
+            raise InputError("estimator", "residual_lr", "set, but LBFGS has only one lr", "null, or another optimizer")
         groups = [{"params": [x for group in groups for x in group["params"]]}]
     if name == "SGD":
         options = options or _PLAIN_SGD
@@ -104,16 +102,16 @@ def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimi
 
 
 def make_schedule(chosen: Mapping[str, Any] | None, optimizer: Optimizer, epochs: int) -> LRScheduler | None:
-    """A schedule that is stepped once per epoch.
+    """Make a learning-rate schedule that is stepped once per epoch.
 
     Args:
-        chosen: its name, and options, of which `T_max` and `total_steps` are `epochs` unless given; None for none.
+        chosen: name and options; `T_max` and `total_steps` default to `epochs`. None for no schedule.
         optimizer: whose learning rate it sets.
         epochs: of the whole run.
 
     Raises:
         UnknownNameError: `torch.optim.lr_scheduler` has no such class.
-        InputError: an option it does not take, or one that a settings file cannot express.
+        InputError: the class does not take an option, or needs one that a settings file cannot express.
     """
     if chosen is None:
         return None
@@ -139,7 +137,7 @@ def _classes(module: Any, base: type) -> dict[str, Any]:
 def _class_and_options(
     chosen: Mapping[str, Any], module: Any, base: type, kind: str, names: Sequence[str]
 ) -> tuple[str, Any, dict[str, Any]]:
-    """Name and class of what was chosen, and its options. Raises UnknownNameError: the module has no such class."""
+    """Name, class and options of a choice. Raises UnknownNameError: the module has no such class."""
     options = dict(chosen)
     name = options.pop("name")
     classes = _classes(module, base)
@@ -150,7 +148,7 @@ def _class_and_options(
 
 
 def _construct(field: str, cls: Any, first: Any, options: Mapping[str, Any]) -> Any:
-    """An instance. Raises InputError: options that its class does not take."""
+    """Make an instance. Raises InputError: the class does not take the options."""
     try:
         return cls(first, **options)
     except _FAILURES as error:
@@ -169,9 +167,9 @@ _LEAST_EIGENVALUE = 1e-3  # above the margin: initial one of a body whose nomina
 
 
 class LearnableParameters(nn.Module, ABC):
-    """phi, (12 L,), and M terms, if the problem has any, as a function of `raw`, which is 0 at the nominal parameters.
+    """Parameters phi, (12 L,), and M terms as a function of `raw`, which is 0 at the nominal parameters.
 
-    phi is a function of `preconditioner @ raw`: in the units of `raw` the compressed problem's Hessian is near the
+    phi is a function of `preconditioner @ raw`: in units of `raw` the Hessian of the compressed problem is near the
     identity.
     """
 
@@ -233,7 +231,7 @@ def _inverse_root(hessian: Tensor, damping: float) -> Tensor:
 
 
 class FreeParameters(LearnableParameters):
-    """Any phi: nominal parameters plus deviations of the free ones in units of their scale."""
+    """Parameters without conditions: nominal values plus scaled deviations of the free ones."""
 
     def __init__(self, problem: LinearProblem) -> None:
         """Start at the nominal parameters of a problem."""
@@ -245,11 +243,11 @@ class FreeParameters(LearnableParameters):
 
 
 class LogCholeskyParameters(LearnableParameters):
-    """Only physically consistent phi: scaled pseudo-inertias above a margin, positive friction.
+    """Physically consistent parameters: scaled pseudo-inertias above a margin, positive friction.
 
-    J = margin I + R R^T with R = R_0 M, where R_0 is the Cholesky factor at the nominal parameters and M is lower
-    triangular with the logarithms of its diagonal and its other entries as coordinates, so that M is the identity where
-    they are 0. Friction is a softplus.
+    J = margin I + R R^T with R = R_0 M. R_0 is the Cholesky factor at the nominal parameters. M is lower triangular;
+    its coordinates are the logarithms of its diagonal and its other entries, so M is the identity at 0. Friction is a
+    softplus.
 
     Source: Rucker, Wensing, "Smooth parameterization of rigid-body inertia", RA-L 2022.
     """
@@ -262,10 +260,10 @@ class LogCholeskyParameters(LearnableParameters):
 
         Args:
             problem: its nominal parameters, scale and free parameters are used.
-            margin: least eigenvalue of every free body's scaled pseudo-inertia.
+            margin: smallest eigenvalue of every free body's scaled pseudo-inertia.
 
         Raises:
-            ValueError: inertial parameters that are not free body by body.
+            ValueError: a body has both free and fixed inertial parameters.
         """
         free = problem.free.reshape(-1, PER_BODY)
         bodies = problem.free_bodies()
@@ -292,7 +290,7 @@ class LogCholeskyParameters(LearnableParameters):
             self.register_buffer(name, torch.from_numpy(np.array(array)))
 
     def constrained(self, u: Tensor) -> Tensor:
-        """Parameters (12 L,) at log-Cholesky coordinates `u`, ten by body, then friction."""
+        """Parameters (12 L,) at log-Cholesky coordinates `u`: ten per body, then friction."""
         bodies = len(self.root)
         coordinates = u[: INERTIAL.stop * bodies].reshape(bodies, INERTIAL.stop)
         rows = self.get_buffer("_rows")
@@ -316,13 +314,13 @@ LEAST_LOGARITHM = 1e-4
 
 @dataclass(frozen=True)
 class PenaltyWeights:
-    """Weights of the penalties beside the mean squared whitened residual.
+    """Weights of the penalties that are added to the mean squared whitened residual.
 
     Attributes:
-        eigenvalue: squares of the shortfall of scaled pseudo-inertias' eigenvalues from the margin.
-        log_det: minus the logarithms of these eigenvalues less the margin, a barrier.
-        mass: squares of negative masses, in units of their scale.
-        friction: squares of negative friction, in units of its scale.
+        eigenvalue: of the squared shortfall of the scaled pseudo-inertias' eigenvalues below the margin.
+        log_det: of minus the logarithm of these eigenvalues above the margin (a barrier).
+        mass: of squared negative masses, in units of their scale.
+        friction: of squared negative friction, in units of its scale.
     """
 
     eigenvalue: NotNegative = 10.0
@@ -373,15 +371,13 @@ class TrainingSettings:
     """Optimizer, learning-rate schedule and stopping rule of a descent.
 
     Attributes:
-        epochs: passes over the logs, at most.
-        optimizer: name, one of `optimizer_names()`, and options of a class of `torch.optim`; defaults are those of
-            `OPTIMIZERS`.
+        epochs: largest number of passes over the logs.
+        optimizer: name, one of `optimizer_names()`, and options of a class of `torch.optim`; defaults in `OPTIMIZERS`.
         schedule: name and options of a class of `torch.optim.lr_scheduler`, stepped once per epoch; None for none.
-        patience: epochs without a better loss on the held-out logs after which training stops; None: never.
+        patience: training stops after this number of epochs without a smaller loss on the held-out logs; None: never.
         clip: largest norm of a gradient.
         damping: of the preconditioner, in units of the mean squared whitened residual per squared scale.
-        finish: after the last epoch, take the parameters of the least objective on all samples. Without held-out logs
-            only, whose least loss is what to stop at.
+        finish: whether to take, after the last epoch, the optimum on all samples. Only without held-out logs.
     """
 
     epochs: Count = 200
@@ -393,11 +389,11 @@ class TrainingSettings:
     finish: bool = True
 
     def try_out(self) -> None:
-        """Take two steps on a parabola and run the schedule through all epochs, so that invalid options fail early.
+        """Test the options early: take two steps on a parabola and run the schedule through all epochs.
 
         Raises:
-            UnknownNameError: an optimizer or a schedule that torch does not have.
-            InputError: options, or a kind of optimizer, that do not work here.
+            UnknownNameError: torch has no such optimizer or schedule.
+            InputError: the options or the optimizer do not work here.
         """
         x = nn.Parameter(torch.ones(3, dtype=torch.float64))
         optimizer = make_optimizer(self.optimizer, [{"params": [x]}])
@@ -424,17 +420,17 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class Sgd(TrainingSettings, Regularized):
-    """min of the mean squared whitened residual + ridge * prior + penalties, one mini-batch at a time.
+    """Mini-batch descent on the mean squared whitened residual + ridge * prior + penalties.
 
     Attributes:
-        consistency: "log_cholesky", bodies have pseudo-inertias above the margin and positive friction in every step,
-            and meet all conditions at the end; "penalties", what breaks the margin or these signs costs, and there are
-            no other conditions.
+        consistency: "log_cholesky": pseudo-inertias stay above the margin and friction stays positive in every step;
+            all conditions hold at the end. "penalties": violations of the margin or these signs cost; there are no
+            other conditions.
         prior, conditions: as in `Consistent`.
-        penalties: their weights, for "penalties".
-        residual_lr: learning rate of a residual module; None: the optimizer's.
-        residual_weight: of the mean square of the module's whitened force in the loss: a module that can fit any force
-            fits the share 1 / (1 + residual_weight) of the residual.
+        penalties: weights, for "penalties".
+        residual_lr: learning rate of a residual module; None for that of the optimizer.
+        residual_weight: weight of the module's mean squared whitened force in the loss. A module that can fit any force
+            fits the fraction 1 / (1 + residual_weight) of the residual.
     """
 
     consistency: Consistency = "log_cholesky"
@@ -451,7 +447,7 @@ class Sgd(TrainingSettings, Regularized):
         return build_conic_problem(problem, self.conditions, self.ridge, self.prior)
 
     def learnable(self, problem: LinearProblem) -> LearnableParameters:
-        """The parameters that a descent moves, with their preconditioner."""
+        """Learnable parameters with their preconditioner."""
         learnable: LearnableParameters = FreeParameters(problem)
         damping = self.damping + self.penalties.curvature
         if self.consistency == "log_cholesky":
@@ -462,14 +458,14 @@ class Sgd(TrainingSettings, Regularized):
 
     @property
     def consistent(self) -> Consistent:
-        """The estimator in closed form with the same objective."""
+        """The closed-form estimator with the same objective."""
         return Consistent(self.ridge, self.prior, self.conditions, rank_tolerance=self.rank_tolerance)
 
 
 class Objective(nn.Module):
-    """What a descent minimizes beside the data, and on all samples, at deviations y, (n,), in units of their scale.
+    """Part of a descent's objective without the data, and the quadratic on all samples, at scaled deviations y, (n,).
 
-    They are those of the free parameters, and the terms of the problem.
+    y contains the free parameters and the problem's terms.
     """
 
     root: Tensor
@@ -580,9 +576,9 @@ _MET = 1e-9  # violation of a condition, in units of the scale, that is rounding
 
 
 def nearest_allowed(settings: Sgd, problem: LinearProblem, minimizer: Minimizer) -> Minimizer:
-    """The parameters that meet all conditions of a descent and are nearest to what it has found.
+    """The feasible parameters nearest to the result of a descent.
 
-    Near by what the mean squared whitened residual and the ridge make of the difference.
+    The distance is the change of the mean squared whitened residual plus ridge.
     """
     conic = settings.conic_problem(problem)
     x = np.asarray(np.linalg.solve(conic.deviations, deviations(problem, minimizer)), dtype=np.float64)
@@ -605,10 +601,10 @@ def deviations(problem: LinearProblem, minimizer: Minimizer) -> Array:
 
 @one_thread()
 def excess(settings: Sgd, problem: LinearProblem, minimizer: Minimizer) -> float:
-    """How far the objective of a minimizer is above the least one at most, as a share of that or of what counts as 0.
+    """Upper bound of the relative excess of a minimizer's objective over the least objective.
 
-    The least one is that of the interior-point method; with penalties, which only add to the quadratic, it is at least
-    what this promises along the gradient.
+    The least objective is that of the interior-point method. With penalties, which only add to the quadratic, the
+    gradient gives a lower bound of it.
     """
     if settings.consistency == "penalties":
         penalized = Objective(settings, problem)

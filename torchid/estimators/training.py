@@ -1,4 +1,4 @@
-"""Mini-batch descent, epoch by epoch, with a state that can be saved and resumed; its end on all samples at once."""
+"""Mini-batch descent, epoch by epoch, with a state that can be saved and resumed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class LossTerms:
 
 
 def add_up(terms: LossTerms, trained: Sequence[nn.Parameter]) -> LossTerms:
-    """Add up what the processes that share a batch have: the gradients of what is trained, and the terms, returned."""
+    """Sum the gradients and loss terms of all processes that share a batch; return the terms."""
     trained = [x for x in trained if x.grad is not None]
     own_gradients = [x.grad.cpu().numpy() for x in trained if x.grad is not None]
     values = [{name: float(x) for name, x in sums.items()} for sums in (terms.losses, terms.squares)]
@@ -100,8 +100,8 @@ class Loss(nn.Module):
         """Terms of the loss of one batch.
 
         Args:
-            batch: or what this process has of it.
-            size: samples that all processes have in it, if they share it; their terms add up to those of the batch.
+            batch: the batch, or the part that this process has.
+            size: number of samples in all processes that share the batch; their terms sum to those of the batch.
         """
         settings = self.settings
         phi = self.learnable()
@@ -171,7 +171,7 @@ class Loss(nn.Module):
 
 
 def _difference(problem: LinearProblem, data: LinearProblem, device: torch.device) -> Callable[[Tensor], Tensor]:
-    """Mean square that a problem has beside that of the samples alone, as of known masses, at parameters and terms."""
+    """Mean square of the problem's further equations, such as known masses, at parameters and terms."""
 
     def quadratic(problem: LinearProblem) -> tuple[Tensor, Tensor]:
         A = problem.A
@@ -189,11 +189,11 @@ def _difference(problem: LinearProblem, data: LinearProblem, device: torch.devic
 
 @dataclass(frozen=True)
 class ResidualEffect:
-    """The force of a residual module on the training samples.
+    """Force of a residual module on the training samples.
 
     Attributes:
         rms: by group, "base_force" [N], "base_moment" [N m], "joint_torque" [N m, N] and "limb_wrench" [N, N m].
-        shares: by group, that rms over the rms of the whole force, rigid bodies and module together.
+        shares: by group, this rms divided by the rms of the whole force (rigid bodies and module).
     """
 
     rms: dict[str, float]
@@ -234,20 +234,19 @@ _DIVERGED = 1e6  # times the loss at the nominal parameters, or that of the stat
 
 @dataclass(frozen=True)
 class Epoch:
-    """Losses and figures of one epoch.
+    """Losses and statistics of one epoch.
 
     Attributes:
         number: from 1.
-        losses: means over the batches by term; "data" is the mean squared whitened residual, "total" the sum of all.
-        held_out: mean squared whitened residual on the held-out logs after the epoch, None without any.
-        objective: mean squared whitened residual on all training samples plus prior, of the parameters alone, after the
-            epoch.
-        closed_form: the least objective of any parameters, from `LeastSquares`.
+        losses: means over the batches by term; "data" is the mean squared whitened residual, "total" the sum.
+        held_out: mean squared whitened residual on the held-out logs after the epoch; None without held-out logs.
+        objective: mean squared whitened residual on all training samples plus prior, without the residual module.
+        closed_form: the least objective without conditions, from `LeastSquares`.
         distance: rms difference of the projected whitened forces from those of the closed form.
-        shares: rms of the projected whitened force of the parameters, and of the residual module, over that of the
-            measured force, in the epoch.
-        learning_rate: of the parameters, in the epoch.
-        samples_per_second: trained on.
+        shares: rms of the projected whitened force of the parameters, and of the residual module, divided by that of
+            the measured force.
+        learning_rate: of the parameters.
+        samples_per_second: training speed.
     """
 
     number: int
@@ -263,14 +262,13 @@ class Epoch:
 
 @dataclass(frozen=True, repr=False)
 class SgdEstimate(ConstrainedEstimate):
-    """The result of a descent; objective and distance are those of the parameters alone.
+    """Result of a descent; objective and distance are those of the parameters without residual module.
 
     Attributes:
         epochs: number of epochs run.
         best_epoch: the epoch of these parameters.
-        residual: effect of the residual module, None without one.
-        excess: of the objective over the least one under the same conditions, as a share of this; None with a residual
-            module.
+        residual: effect of the residual module; None without one.
+        excess: (objective - least objective) / least objective under the same conditions; None with a residual module.
     """
 
     epochs: int
@@ -289,10 +287,10 @@ class SgdEstimate(ConstrainedEstimate):
 
 
 class Trainer:
-    """A descent on mini-batches, preconditioned by the compressed problem, with or without a residual module.
+    """Runs a mini-batch descent, preconditioned by the compressed problem, with or without a residual module.
 
-    The same settings, logs and seeds give the same numbers, also if the state is saved after an epoch and loaded into a
-    new trainer. Batches that processes share give all of them these numbers, up to the rounding of sums.
+    The same settings, logs and seeds give the same numbers, also after saving the state and loading it into a new
+    trainer. Processes that share batches get these numbers too, up to rounding of sums.
     """
 
     @report_rounding("sgd")
@@ -309,20 +307,22 @@ class Trainer:
 
         Args:
             settings: of the descent.
-            problem: the compressed training logs: for the preconditioner, the prior, and the closed form. Of samples
-                whose `motion_noise` is None: the descent sees them one by one, with whatever noise they have.
+            problem: the compressed training logs, for the preconditioner, the prior and the closed form. Compress them
+                from samples with `motion_noise` None, because the descent does not correct motion noise.
             batches: of the training logs.
-            held_out: of logs for early stopping.
-            residual: any module r(q, v, a) -> (B, n_rows) [N, N m], on the device of the batches, whose output adds to
+            held_out: batches of logs for early stopping.
+            residual: any module r(q, v, a) -> (B, n_rows) [N, N m] on the device of the batches. Its output is added to
                 K phi; arguments as in `Batch`.
-            data: the problem of the batches' rows alone, where `problem` has more, as known masses; None if it is that.
+            data: the problem of the batches' rows alone, if `problem` has further equations such as known masses; else
+                None.
 
         Raises:
-            InputError: an optimizer or a schedule that does not work with its options; conditions that exclude each
+            InputError: an optimizer or a schedule does not work with its options, or the conditions contradict each
                 other.
+            ValueError: processes share the batches of a full-batch optimizer or a residual module.
         """
         if batches.share[1] > 1 and (residual is not None or settings.optimizer["name"] in FULL_BATCH):
-            reason = f"a share of {batches.share[1]}, with a residual module or {settings.optimizer['name']}"
+            reason = f"found a share of {batches.share[1]} with a residual module or {settings.optimizer['name']}"
             raise ValueError(f"batches: {reason}; accepted: whole batches")
         settings.try_out()
         self.settings = settings
@@ -352,7 +352,7 @@ class Trainer:
 
     @property
     def finished(self) -> bool:
-        """Whether all epochs are done or the held-out loss has stopped falling."""
+        """Whether all epochs are done or the held-out loss has stopped decreasing."""
         if self.epoch >= self.settings.epochs:
             return True
         patience = self.settings.patience
@@ -430,12 +430,12 @@ class Trainer:
         return Minimizer(phi, None if self.problem.terms is None else psi)
 
     def estimate(self) -> SgdEstimate:
-        """The parameters, and residual module, of least held-out loss; without held-out logs the last ones.
+        """Parameters and residual module with the least held-out loss; without held-out logs, the last ones.
 
-        After the last epoch, without held-out logs or a module, those of the least objective on all samples: with
-        penalties by L-BFGS, of possible bodies by the interior-point method, because at the border of what is possible
-        coordinates such as J = R R^T bend faster than descents converge: 800 steps of L-BFGS left a quadruped 0.1 of a
-        parameter's scale away. Statistics are those of least squares with the same ridge.
+        Without held-out logs and module, after the last epoch, the optimum on all samples is returned: by L-BFGS with
+        penalties, by the interior-point method for consistent bodies. Descents converge slowly at the border of the
+        consistent set: 800 steps of L-BFGS left a quadruped 0.1 of a parameter's scale away. Statistics are those of
+        least squares with the same ridge.
         """
         self.loss.load_state_dict(self._best)
         plain = self.closed_form
@@ -461,7 +461,7 @@ class Trainer:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """The state from which a new trainer with the same settings and logs resumes: plain types and tensors."""
+        """State to resume from, with the same settings and logs: plain types and tensors."""
         return {
             "learned": self._snapshot(),
             "best": self._best,
@@ -474,10 +474,10 @@ class Trainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Resume from where `state_dict` was called.
+        """Resume from a saved state.
 
         Raises:
-            ValueError: an epoch that there is not. Torch raises its own errors for states of other settings.
+            ValueError: the epoch does not exist. Torch raises its own errors for states of other settings.
         """
         for name, most in (("epoch", self.settings.epochs), ("best_epoch", state["epoch"])):
             if not (isinstance(state[name], int) and 0 <= state[name] <= most):
@@ -515,7 +515,7 @@ class Trainer:
         if not loss <= _DIVERGED * max(1.0, self.problem.cost(self.problem.nominal) / max(self.problem.rows, 1)):
             name = self.settings.optimizer["name"]
             rate = float(self.optimizer.param_groups[0]["lr"])
-            reason = f"a loss of {loss:.3g} in epoch {self.epoch}, with {name} at lr {rate:.3g}"
+            reason = f"diverged: loss {loss:.3g} in epoch {self.epoch} with {name} at lr {rate:.3g}"
             raise InputError("estimator", "training", reason, "a smaller lr")
 
     def _steps(self) -> Iterator[tuple[Callable[[], Iterable[tuple[Batch, int]]], int]]:

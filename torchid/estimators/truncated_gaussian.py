@@ -133,7 +133,7 @@ def _gaussian_at(conic: ConicProblem, mean: Array, near: np.ndarray) -> BarrierG
     inverse = np.linalg.inv(np.linalg.cholesky(conic.blocks(mean)))[:, None]
     slack = conic.G @ mean - conic.h
     if not (slack > 0.0).all():
-        raise np.linalg.LinAlgError("by rounding, a point is not inside the conditions")
+        raise np.linalg.LinAlgError("rounding moved a point outside the conditions")
     slopes = (inverse @ conic.F @ np.swapaxes(inverse, 2, 3))[:, :, UPPER[0], UPPER[1]]
     blocks = np.zeros((count, len(ENTRY_WEIGHTS), n))
     rows = conic.G / slack[:, None]
@@ -281,8 +281,8 @@ class EllipticalSlice(torch.nn.Module):
                 alike = float((first * _standardized(state.x)).mean(dim=1).max()) if len(state.x) else 0.0
                 if alike <= _ALIKE:
                     return
-        message = f"estimator: after {_MOST} passes states of the sampler are still correlated by {alike:.2g}"
-        warn(f"{message}; samples are of too little variety", NumericalWarning)
+        message = f"the sampler mixes slowly: correlation {alike:.2g} after {_MOST} passes"
+        warn(f"estimator: {message}. The samples vary too little", NumericalWarning)
 
     def _start(self, chains: int, generator: torch.Generator | None) -> _State:
         """Draws from the Gaussian, those outside of the conditions moved to the mean until they are inside."""

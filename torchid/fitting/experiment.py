@@ -57,11 +57,11 @@ from torchid.settings import AUTO
 
 
 def check_scale_groups(terms: ExtraTerms, robot: Robot, contacts: Sequence[Contact]) -> None:
-    """Refuse groups of `sensors.scales` that name what the robot does not have, or one sensor twice.
+    """Check the groups of `sensors.scales`.
 
     Raises:
-        UnknownNameError: a pattern that no joint or frame fits.
-        ConfigError: a joint or frame in two groups.
+        UnknownNameError: no joint or frame matches a pattern.
+        ConfigError: a joint or frame is in two groups.
     """
     frames = tuple(contact.frame for contact in contacts)
     names = dict.fromkeys(CHANNELS, frames) | {"joint_torque": robot.joint_names}
@@ -76,16 +76,16 @@ def check_scale_groups(terms: ExtraTerms, robot: Robot, contacts: Sequence[Conta
             for name in (x for x in names[kind] if any(fits(x, pattern) for pattern in group)):
                 if name in group_of:
                     both = f"[{', '.join(group_of[name])}] and [{', '.join(group)}]"
-                    raise ConfigError.at_field(field, f"'{name}' in two groups, {both}", "one group, or none, for each")
+                    raise ConfigError.at_field(field, f"'{name}' in two groups, {both}", "at most one group for a name")
                 group_of[name] = group
 
 
 def stated_noise(config: NoiseConfig, robot: Robot) -> dict[str, Any]:
-    """What is stated of the noise of the forces, by field of `SensorNoise`.
+    """Stated noise of the forces, by field of `SensorNoise`.
 
     Raises:
-        UnknownNameError: a pattern that no joint fits.
-        ConfigError: a joint without a figure, where others have one, or with two.
+        UnknownNameError: no joint matches a pattern.
+        ConfigError: a joint has no value although others have, or has two.
     """
     stated = config.forces
     if (torque := stated.get("joint_torque")) is not None:
@@ -96,7 +96,7 @@ def stated_noise(config: NoiseConfig, robot: Robot) -> dict[str, Any]:
 
 
 def require_comparable(noise: Sequence[float]) -> None:
-    """Refuse standard deviations of forces by which float64 cannot weight rows. Raises InputError."""
+    """Raise InputError if standard deviations are too different to weight rows in float64."""
     low = min(noise, default=1.0)
     high = max(noise, default=1.0)
     if low < 1e-9 or high > min(1e6, 1e7 * low):
@@ -106,16 +106,16 @@ def require_comparable(noise: Sequence[float]) -> None:
 
 
 def task_weights(config: TaskWeightsConfig, robot: Robot) -> Array | None:
-    """Task weights as `SensorSet` has them; None if all are alike, as only their ratios count.
+    """Task weights for `SensorSet`; None if all are equal, because only their ratios matter.
 
     Raises:
-        UnknownNameError: a pattern that no joint fits.
-        ConfigError: a joint without a weight, where others have one, or with two; an axis of a fixed base.
+        UnknownNameError: no joint matches a pattern.
+        ConfigError: a joint has no weight although others have, or has two; or weights for the axes of a fixed base.
     """
     key = "estimator.task_weights"
     base = (config.base_force, config.base_moment)
     if robot.fixed_base and any(x is not None for x in base):
-        raise ConfigError.at_field(key, "axes of the base, which is fixed", "joint_torque alone")
+        raise ConfigError.at_field(key, "base_force or base_moment of a fixed base", "joint_torque only")
     torque = for_all(1.0 if config.joint_torque is None else config.joint_torque)
     joints = values_of_all(f"{key}.joint_torque", "weight", torque, "joint", robot.joint_names)
     of_base = [np.ones(robot.base_rows // 2) * (1.0 if x is None else x) for x in base]
@@ -126,34 +126,36 @@ def task_weights(config: TaskWeightsConfig, robot: Robot) -> Array | None:
 def check_terms(
     terms: ExtraTerms, actuators: object, robot: Robot, contacts: Sequence[Contact], sensors: SensorSet
 ) -> None:
-    """Refuse extra parameters of channels that nothing measures; all kinds of channels mean those that are measured.
+    """Raise an error for extra parameters of channels that are not measured.
+
+    Settings for all channels mean the measured ones.
 
     Args:
-        terms: that are fitted.
-        actuators: the block of that name.
+        terms: extra parameters to fit.
+        actuators: the block `actuators`.
         robot: the robot.
-        contacts: of it.
+        contacts: of the robot.
         sensors: what is measured.
 
     Raises:
-        ConfigError: a kind of channels, or actuators' terms, without a sensor.
-        UnknownNameError: a group's pattern that fits no sensor that is measured.
+        ConfigError: a channel or an actuator term has no sensor.
+        UnknownNameError: no measured sensor matches a group's pattern.
     """
     measured = measured_channels(robot, contacts, sensors)
     for key, scopes in {"offsets": terms.offsets, "scales": terms.scales}.items():
         for channel, scope in scopes.items():
             if channel not in measured and (len(scopes) < len(CHANNELS) or not isinstance(scope, str)):
-                accepted = f"{', '.join(measured)}, or log or all for every kind that is measured"
+                accepted = f"{', '.join(measured)}; or {key}: log, {key}: all for all measured kinds"
                 raise ConfigError.at_field(f"sensors.{key}.{channel}", "no such sensor is measured", accepted)
     for kind, groups in _groups(terms).items():
         for pattern in (pattern for group in groups for pattern in group):
             if not _fitting(measured[kind], pattern):
-                what = f"whose {kind} is not measured"
+                what = f"its {kind} is not measured"
                 raise UnknownNameError.at_field(f"sensors.scales.{kind}", pattern, measured[kind], what)
     by_default = vars(type(actuators)())
     for name, value in vars(actuators).items():
         if value and value != by_default[name] and "joint_torque" not in measured:
-            accepted = "joint torques among the sensors, or no such key"
+            accepted = "joint torques in sensors, or remove this key"
             raise ConfigError.at_field(f"actuators.{name}", "set, but no joint torque is measured", accepted)
 
 
@@ -169,10 +171,10 @@ _ALONG = 0.01  # rad, up to which an IMU's frame is along the base's axes
 
 
 def require_maps_of(robot: Robot, logs: LogsConfig) -> None:
-    """Make sure that maps of topics and columns, and payloads, are of a robot.
+    """Check that maps of topics and columns, and payloads, fit a robot.
 
     Raises:
-        InputError: joints, contacts or links that the robot does not have, or an IMU that does not suit its base.
+        InputError: the robot has no such joint, contact or link, or an IMU does not fit its base.
     """
     joints = [*(body.joint.name for body in robot.bodies if body.joint is not None), *robot.welded]
     require_joints(logs.topics, joints)
@@ -183,17 +185,17 @@ def require_maps_of(robot: Robot, logs: LogsConfig) -> None:
 
 
 def _require_base_axes(robot: Robot, topics: Topics | None) -> None:
-    """Refuse an IMU whose quaternion is to be the base's orientation, though its frame is turned against the base."""
+    """Raise ConfigError if an IMU's quaternion is used for the base but its frame is rotated relative to the base."""
     for key in ("low_state", "imu"):
         topic = getattr(topics, key, None)
         if topic is None or not topic.orientation:
             continue
         if topic.frame is None and key == "imu":
-            raise ConfigError.at_field("logs.topics.imu.frame", "missing, with orientation: true", "a link of the base")
+            raise ConfigError.at_field("logs.topics.imu.frame", "missing with orientation: true", "a link of the base")
         if topic.frame in robot.links and robot.links[topic.frame][0] == 0 and not is_along_base(robot, topic.frame):
             angle = np.degrees(_angle_to_base(robot, topic.frame))
-            reason = f"'{topic.frame}', which is turned by {angle:.0f} deg against {robot.base_link}"
-            accepted = "a frame along the base's axes, or orientation: false, which leaves the IMU's quaternion out"
+            reason = f"'{topic.frame}' is rotated by {angle:.0f} deg relative to {robot.base_link}"
+            accepted = "a frame with the axes of the base, or orientation: false to ignore the IMU's quaternion"
             raise ConfigError.at_field(f"logs.topics.{key}.frame", reason, accepted)
 
 
@@ -207,13 +209,13 @@ def _angle_to_base(robot: Robot, link: str) -> float:
 
 
 def resolve_contacts(settings: Sequence[ContactConfig], robot: Robot) -> tuple[tuple[Contact, ...], str]:
-    """The contacts of a robot, and on what they roll by what source, "" where nothing rolls or could.
+    """The contacts of a robot, and a text about what they roll on and where this comes from ("" if nothing rolls).
 
     Raises:
-        UnknownNameError: a frame that the URDF does not have.
-        SensorError: a frame named twice.
-        ConfigError: a radius of a flat contact, a centre of another contact than a point, a normal of no length.
-        UrdfError: a collision shape that is not described by numbers.
+        UnknownNameError: the robot has no such frame.
+        SensorError: a frame is named twice.
+        ConfigError: a flat contact has a radius, a line or flat contact has a centre, or a normal has length 0.
+        UrdfError: a collision shape is not described by numbers.
     """
     contacts = validate_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in settings])
     out: list[Contact] = []
@@ -242,10 +244,10 @@ def _rolling_text(contact: Contact, shape: RollingShape | None, is_auto: bool) -
     """On what a contact rolls, and from where that is known."""
     if is_auto and shape is None:
         missing = "sphere" if contact.kind == "point" else "cylinder along the line"
-        return f"radius 0: no {missing} found in the URDF; state contacts[].radius if it rolls"
+        return f"radius 0: no {missing} in the robot file; set contacts[].radius if it rolls"
     text = f"{'ball' if contact.kind == 'point' else 'cylinder'} of radius {1e3 * contact.radius:.3g} mm"
     if any(contact.centre):
-        text += f" about {join_numbers(float(f'{1e3 * x:.2g}') for x in contact.centre)} mm"
+        text += f", centre {join_numbers(float(f'{1e3 * x:.2g}') for x in contact.centre)} mm"
     text += "" if contact.normal == UP else f", normal {join_numbers(contact.normal)}"
     if shape is None:
         return f"{text}, as stated"
@@ -262,31 +264,31 @@ def with_scalar_sensors(contacts: Sequence[Contact], sensors: ChoiceConfig) -> t
 def suited_to_preprocessing(
     contacts: tuple[Contact, ...], config: ExperimentConfig | AnalyzeConfig, robot: Robot
 ) -> tuple[Contact, ...]:
-    """The contacts, after making sure that flags and a base's motion can follow from them where settings want that.
+    """Check that flags and base motion can follow from the contacts, as far as settings need this; return the contacts.
 
     Raises:
-        ConfigError: a fixed base, closed loops, feet that are too few even if all stand, normals of several floors, or
-            thresholds of detection that contradict each other.
+        ConfigError: the base is fixed, the robot has loops, there are too few feet, normals differ, or thresholds of
+            detection contradict each other.
     """
     settings = config.preprocessing
     for key in ("detect_contacts", "base_motion"):
         if getattr(settings, key) is not None and config.robot.fixed_base:
-            accepted = "null, or a base that floats"
-            raise ConfigError.at_field(f"preprocessing.{key}", "set, though robot.fixed_base is true", accepted)
+            accepted = "null, or a floating base"
+            raise ConfigError.at_field(f"preprocessing.{key}", "set, but robot.fixed_base is true", accepted)
     for key in ("detect_contacts", "contact_threshold"):
         if getattr(settings, key) is not None and not contacts:
-            raise ConfigError.at_field(f"preprocessing.{key}", "set, without contacts", "contacts to detect")
+            raise ConfigError.at_field(f"preprocessing.{key}", "set, but contacts is empty", "the feet in contacts")
     if settings.zero_in_air and not contacts:
-        raise ConfigError.at_field("preprocessing.zero_in_air", "true, without contacts", "false, or contacts")
+        raise ConfigError.at_field("preprocessing.zero_in_air", "true, but contacts is empty", "false, or contacts")
     if settings.detect_contacts is not None:
         if robot.loops:
-            reason = f"set, for a robot with {format_count(len(robot.loops), 'closed loop')}"
+            reason = f"set, but the robot has {format_count(len(robot.loops), 'closed loop')}"
             raise ConfigError.at_field("preprocessing.detect_contacts", reason, "contact_threshold, or recorded flags")
         touch = settings.detect_contacts.touch
         lift = settings.detect_contacts.lift
         if lift > touch:
             reason = f"{lift:g}, above touch ({touch:g})"
-            accepted = "a share of the weight up to that of touch"
+            accepted = "a fraction of the weight, at most touch"
             raise ConfigError.at_field("preprocessing.detect_contacts.lift", reason, accepted)
     if settings.base_motion is not None:
         _require_floor(contacts)
@@ -294,14 +296,14 @@ def suited_to_preprocessing(
 
 
 def _require_floor(contacts: tuple[Contact, ...]) -> None:
-    """Refuse contacts that do not say how a base stands above one floor, even if all stand."""
+    """Raise ConfigError if the contacts do not determine the base pose above one floor, even if all stand."""
     if sum(map(points_of, contacts)) < FEWEST_POINTS:
-        reason = f"contacts, but the experiment has {', '.join(f'{c.kind} {c.frame}' for c in contacts) or 'none'}"
-        raise ConfigError.at_field("preprocessing.base_motion", reason, f"{FEET} among the contacts")
+        reason = f"contacts, but the contacts are {', '.join(f'{c.kind} {c.frame}' for c in contacts) or 'none'}"
+        raise ConfigError.at_field("preprocessing.base_motion", reason, f"{FEET} in contacts")
     for index, contact in enumerate(contacts):
         if not np.allclose(contact.normal, contacts[0].normal, rtol=0.0, atol=1e-9):
             reason = f"{join_numbers(contact.normal)}, but contacts[0] has {join_numbers(contacts[0].normal)}"
-            accepted = "one floor for all contacts, or preprocessing.base_motion: null"
+            accepted = "the same normal for all contacts, or preprocessing.base_motion: null"
             raise ConfigError.at_field(f"contacts[{index}].normal", reason, accepted)
 
 
@@ -313,10 +315,10 @@ class RobotSetup:
         config: the settings.
         robot: the robot.
         contacts: the contacts in use.
-        rolling: what the contacts that roll roll on, and where that is stated, "" if none does.
-        open_radii: frames of points whose radius the settings leave open.
-        estimated_noise: by field of `SensorNoise`, what logs show of the noise that is not stated (`with_noise`).
-        noise_stated: whether a user has stated any noise of the forces, once others are estimated.
+        rolling: text about what contacts roll on and where this comes from, "" if nothing rolls.
+        open_radii: frames of point contacts without a stated radius.
+        estimated_noise: estimated values of noise that is not stated, by field of `SensorNoise` (`with_noise`).
+        noise_stated: whether the user stated any noise of the forces.
     """
 
     config: ExperimentConfig | AnalyzeConfig
@@ -340,10 +342,10 @@ class RobotSetup:
 
     @property
     def noise_of_readings(self) -> SensorNoise | None:
-        """The noise of readings as recorded, NaN where it is unknown; None where it is not stated of any sensor.
+        """Noise of the recorded readings, NaN where unknown; None if no sensor's noise is stated.
 
-        Noise that was estimated beside a stated one is in proportion to it. Without any, it comes from the residuals
-        themselves, which it could not judge.
+        Estimated noise is relative to the stated one. Without any stated noise it comes from the residuals, so it could
+        not judge them.
         """
         stated = stated_noise(self.config.sensors.noise, self.robot)
         known = {**self.estimated_noise, **stated} if self.noise_stated else stated
@@ -457,16 +459,16 @@ class RobotSetup:
     def choose_ridge(
         self, parts: Sequence[Part], blocks: Sequence[Block], fitter: LogFitter, conditions: Conditions
     ) -> RidgeChoice:
-        """The ridge by the size of the residuals, or by one standard error, for the estimator of the settings.
+        """Choose the ridge from the size of the residuals, or by one standard error, for the estimator of the settings.
 
-        Bodies are off the URDF by a relative error of about 20 to 30 %, and residuals are no white noise: what the
-        model lacks does not average out. A ridge of `RIDGE` times the mean squared residual says both, whatever
-        the length of the log; larger ones are taken where left-out blocks ask for them.
+        Bodies differ from the URDF by about 20 to 30 %, and residuals are not white noise: model errors do not average
+        out. A ridge of `RIDGE` times the mean squared residual covers both, for any length of the log. Cross-validation
+        may choose a larger one.
 
         Args:
             parts: of the blocks, compressed.
-            blocks: training logs, as `split_into_folds` or `fold_compressed` cuts them.
-            fitter: of their rows.
+            blocks: training logs from `split_into_folds` or `fold_compressed`.
+            fitter: of the rows.
             conditions: on the parameters.
 
         Raises:
@@ -487,7 +489,7 @@ class RobotSetup:
         try:
             return choose_ridge(parts, blocks, fitter, estimators, rule=settings.ridge_rule)
         except LogError as error:
-            accepted = "a number, 0.001 say, or longer logs"
+            accepted = "a number such as 0.001, or longer logs"
             raise ConfigError.at_field("estimator.ridge", f"{settings.ridge}, but {error.found}", accepted) from error
 
 
@@ -503,7 +505,7 @@ S = TypeVar("S", bound=RobotSetup)
 
 
 def with_noise(setup: S, summary: NoiseSummary) -> S:
-    """The setup with estimated noise beside what its settings state, so that every later step uses it."""
+    """Add estimated noise to the stated one; all later steps use it."""
     return with_estimated_noise(setup, summary.known, summary.any_stated)
 
 
@@ -516,19 +518,19 @@ def with_estimated_noise(setup: S, estimated: Mapping[str, Any], any_stated: boo
 
 
 def with_radius(setup: S, radius: float) -> S:
-    """The setup whose feet of open radius are balls about their frames [m]."""
+    """Replace contacts without a stated radius by balls about their frames; `radius` in [m]."""
     contacts = tuple(
         replace(x, radius=radius, centre=(0.0, 0.0, 0.0)) if x.frame in setup.open_radii else x for x in setup.contacts
     )
     stated = [
         replace(x, radius=radius, centre=[0.0] * 3) if x.frame in setup.open_radii else x for x in setup.config.contacts
     ]
-    text = f"{join_names(sorted(setup.open_radii))}: ball of radius {1e3 * radius:.3g} mm, by the logs"
+    text = f"{join_names(sorted(setup.open_radii))}: ball of radius {1e3 * radius:.3g} mm, chosen from the logs"
     return replace(setup, contacts=contacts, config=replace(setup.config, contacts=stated), rolling=text)
 
 
 def with_task_weights(experiment: Experiment, logs: Sequence[Samples]) -> Experiment:
-    """The experiment, its rows weighted by control task too, by a factor at which noise alone leaves them 1."""
+    """Add task weights to the rows, scaled so that pure noise has mean square 1."""
     weights = task_weights(experiment.config.estimator.task_weights, experiment.robot)
     if weights is None:
         return experiment
@@ -538,19 +540,19 @@ def with_task_weights(experiment: Experiment, logs: Sequence[Samples]) -> Experi
 
 
 def require_device(device: str) -> None:
-    """Refuse a device that this machine has not; it is not connected to: forks, which read logs, could not be made."""
+    """Raise ConfigError if this machine does not have the device. Opens no connection to it, to allow forks later."""
     kind, _, index = device.partition(":")
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     is_there = kind == "cuda" and (index or "0").isdecimal() and int(index or "0") < gpus
     if device != "cpu" and not is_there:
-        raise ConfigError.at_field("device", f"'{device}' is not available here", "cpu, cuda, cuda:0, ...")
+        raise ConfigError.at_field("device", f"'{device}' is not available on this machine", "cpu, cuda, cuda:0, ...")
 
 
 def set_up_robot(config: ExperimentConfig | AnalyzeConfig) -> RobotSetup:
-    """Load the robot of an experiment file and look its contacts up.
+    """Load the robot of an experiment file and resolve its contacts.
 
     Raises:
-        InputError: whatever in the file does not fit the robot.
+        InputError: a setting does not fit the robot.
     """
     require_device(config.device)
     try:
@@ -576,7 +578,7 @@ def set_up_robot(config: ExperimentConfig | AnalyzeConfig) -> RobotSetup:
         field = _ft_field(config, error.name)
         raise UnknownNameError.at_field(field, error.name, error.valid, error.what) from error
     if not robot.nv:
-        raise ConfigError.at_field("robot", "a fixed base without a joint, which never moves", "a robot that can move")
+        raise ConfigError.at_field("robot", "no joint moves and the base is fixed", "a robot that can move")
     if config.logs is not None:
         require_maps_of(robot, config.logs)
     contacts, rolling = resolve_contacts(config.contacts, robot)

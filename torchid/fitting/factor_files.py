@@ -47,13 +47,13 @@ NOISE = "sensors.noise"
 
 @plain_dataclass(frozen=True)
 class RowModel:
-    """Robot, contacts, sensors, extra parameters and preprocessing that rows were formed with.
+    """Robot, contacts, sensors, extra parameters and preprocessing that made the rows.
 
     Attributes:
-        settings: by the key of an experiment file that they come from; names of the robot's parts under "robot.urdf",
-            and the number of columns.
+        settings: by key of the experiment file; names of the robot's parts under "robot.urdf", and the number of
+            columns.
         noise: standard deviations of the sensors by group [N m, N].
-        geometry: constants of the kinematic tree and poses of contacts, in units of the URDF.
+        geometry: constants of the kinematic tree and poses of contacts, in the units of the URDF.
     """
 
     settings: dict[str, Value]
@@ -64,15 +64,15 @@ class RowModel:
 
     @classmethod
     def of(cls, robot: Robot, builder: RowBuilder, preprocessing: Mapping[str, float | None]) -> RowModel:
-        """The model of the rows of a builder.
+        """The row model of a builder.
 
-        Nominal inertial parameters, friction to fit and all other settings of estimators are not in it: these are the
-        affair of a fit, and robots of one type may differ in them.
+        It excludes nominal inertial parameters, fitted friction and all estimator settings: these belong to a fit, and
+        robots of one type may differ in them.
 
         Args:
             robot: the robot.
             builder: of the rows.
-            preprocessing: settings that samples depend on.
+            preprocessing: settings that change the samples.
         """
         tree = builder.tree
         extras = builder.extras
@@ -121,16 +121,16 @@ class RowModel:
 
 
 def require_same_rows(path: object, actual: RowModel, expected: RowModel, reference: str) -> None:
-    """Refuse factors of rows that were formed with something else than others; noise is another matter.
+    """Raise LogError if factors were made with other settings than expected; noise is not compared.
 
     Args:
         path: of the factors, for the message.
-        actual: what they were formed with.
-        expected: what they should have been formed with.
-        reference: where that is stated.
+        actual: model of the factors.
+        expected: model to compare with.
+        reference: origin of the expected model, for the message.
 
     Raises:
-        LogError: names the setting, its value and the accepted one.
+        LogError: names the setting, its value and the accepted value.
     """
     for key in (*expected.settings, *(key for key in actual.settings if key not in expected.settings)):
         value = actual.settings.get(key)
@@ -148,14 +148,10 @@ def require_same_rows(path: object, actual: RowModel, expected: RowModel, refere
 
 
 def require_same_noise(path: object, actual: RowModel, expected: RowModel, reference: object) -> None:
-    """Refuse factors that were weighted with other noise than others, of rows that are alike otherwise.
-
-    Raises:
-        LogError: names the noise, its value and the accepted one.
-    """
+    """Raise LogError if factors were weighted with other noise than expected; the message names the noise."""
     for group, value in expected.noise.items():
         if not np.isclose(actual.noise[group], value, rtol=KINEMATIC_TOLERANCE, atol=0.0):
-            accepted = f"{value:g}, as in {reference}: compress with all of sensors.noise stated"
+            accepted = f"{value:g}, as in {reference}; state all of sensors.noise and compress again"
             raise LogError(path, f"{NOISE}.{group}", f"{actual.noise[group]:g}", accepted)
 
 
@@ -188,8 +184,8 @@ def _texts(actual: Value, expected: Value, reference: str) -> tuple[str, str]:
     if not (isinstance(actual, list) and isinstance(expected, list)):
         return _text(actual), f"{_text(expected)}, as in {reference}"
     missing, more = ([x for x in a if x not in b] for a, b in ((expected, actual), (actual, expected)))
-    texts = [f"{what} {join_names(names)}" for what, names in (("without", missing), ("with", more)) if names]
-    return " and ".join(texts) or "another order", f"those of {reference}: {join_names(expected) or 'none'}"
+    texts = [f"{what} {join_names(names)}" for what, names in (("lacks", missing), ("has also", more)) if names]
+    return " and ".join(texts) or "another order", f"{join_names(expected) or 'none'}, as in {reference}"
 
 
 def _text(value: Value) -> str:
@@ -206,11 +202,11 @@ def _where(name: str, actual: Array, expected: Array, model: RowModel) -> str:
     worst = int(apart.argmax())
     if "contact" in name:
         contacts = model.settings["contacts"]
-        return f"contact {contacts[worst] if isinstance(contacts, list) else worst} is {apart[worst]:.2g} off"
+        return f"contact {contacts[worst] if isinstance(contacts, list) else worst} differs by {apart[worst]:.2g}"
     bodies = model.settings["robot.urdf"]
     known = isinstance(bodies, list) and len(bodies) == len(expected)
     part = f"{bodies[worst]}" if isinstance(bodies, list) and known else f"frame {worst}"
-    return f"{name} of {part} is {apart[worst]:.2g} off"
+    return f"{name} of {part} differs by {apart[worst]:.2g}"
 
 
 Whole = Annotated[int, Field(ge=0, le=2**53)]
@@ -218,7 +214,7 @@ Whole = Annotated[int, Field(ge=0, le=2**53)]
 
 @dataclass(config=STRICT, frozen=True)
 class _Part:
-    """A part but for its numbers: `blocks` are numbers of supports with those of rows, `noise_gram` of supports."""
+    """A part without its numbers: `blocks` are numbers of supports and of rows, `noise_gram` of supports."""
 
     state: Annotated[str, Field(pattern="^[01]*$")]
     samples: Whole
@@ -254,14 +250,14 @@ def _pack(parts: Sequence[Part], supports: dict[tuple[int, ...], int], values: l
 
 
 class _PartReader:
-    """Reads the parts of a log, one after the other; ValueError where one cannot be that of a log."""
+    """Reads the parts of a log in order; ValueError if a part does not fit the log."""
 
     def __init__(self, source: str, description: _Description, values: Array) -> None:
         settings = description.settings
         columns = settings.get("columns")
         contacts = settings.get("contacts")
         if not isinstance(columns, int) or columns < 1 or not isinstance(contacts, list):
-            raise ValueError("neither columns nor contacts")
+            raise ValueError("no columns or contacts")
         self._source = source
         self._values = values
         self._taken = 0
@@ -269,29 +265,29 @@ class _PartReader:
         self._contacts = len(contacts)
         self._supports = [tuple(support) for support in description.supports]
         if any(len(set(x)) != len(x) or max(x, default=0) >= columns for x in self._supports):
-            raise ValueError(f"columns that are not among {columns}")
+            raise ValueError(f"a column number of {columns} or more")
 
     def read(self, part: _Part, unloaded: bool = False) -> Part:
         """The next part."""
         if len(part.state) != self._contacts or (unloaded and part.samples):
-            raise ValueError("a part of other contacts or samples")
+            raise ValueError("a part with other contacts or samples than the log")
         if not part.independent_rows <= part.rows or (part.rows and not part.independent_rows):
-            raise ValueError(f"{part.independent_rows:g} independent of {part.rows} rows")
+            raise ValueError(f"{part.independent_rows:g} independent rows, but {part.rows} rows")
         blocks = {self._supports[number]: self._block(number, rows) for number, rows in part.blocks}
         halves = {self._supports[n]: self._block(n, len(self._supports[n]) + 1) for n in part.noise_gram}
         if len(blocks) != len(part.blocks) or len(halves) != len(part.noise_gram):
-            raise ValueError("the same columns twice")
+            raise ValueError("duplicate columns")
         noise_gram = {support: half + half.triu(1).T for support, half in halves.items()}
         factor = TriangularFactor(self._columns, part.rows, part.independent_rows, blocks, noise_gram)
         state = tuple(digit == "1" for digit in part.state)
         return Part(self._source, state, factor, part.samples, unloaded=unloaded, masked=set(part.masked))
 
     def _block(self, number: int, rows: int) -> torch.Tensor:
-        """The next triangle, or rows too few to make one, in some columns and the right-hand side."""
+        """The next triangle, or fewer rows than a triangle, in some columns and the right-hand side."""
         width = len(self._supports[number]) + 1
         size = width * (width + 1) // 2 if rows == width else rows * width
         if rows > width or size > len(self._values) - self._taken:
-            raise ValueError("other numbers than are described")
+            raise ValueError("fewer numbers than described")
         values = self._values[self._taken : self._taken + size]
         self._taken += size
         if rows < width:
@@ -301,15 +297,15 @@ class _PartReader:
         return torch.from_numpy(triangle)
 
     def require_all_read(self) -> None:
-        """Refuse numbers that belong to no part."""
+        """Raise ValueError if there are more numbers than described."""
         if self._taken < len(self._values):
-            raise ValueError("more numbers than are described")
+            raise ValueError("more numbers than described")
 
 
 FORMAT = 4
 """Version of the format, a whole number that grows whenever a reader of an older version would be wrong."""
 
-_ACCEPTED = f"a whole {FACTORS} file, as torchid compress writes it"
+_ACCEPTED = f"a complete {FACTORS} file from torchid compress"
 _GEOMETRY = ("T_parent_joint", "T_joint_link", "joint_map", "joint_constant", "contact_node", "T_node_contact")
 _LARGEST = 1e30  # of a number: squares stay within the range of float64
 _Text = Annotated[str, Field(max_length=10 * MAX_LETTERS)]
@@ -318,18 +314,19 @@ _Origin = Literal["estimated", "pooled", "at most", "confounded", "assumed"]
 
 @plain_dataclass(frozen=True)
 class FactorFile:
-    """A compressed log with what its rows were formed with, and where it comes from.
+    """A compressed log with the model of its rows and its origin.
 
     Attributes:
         log: factors of the log.
-        model: what the rows were formed with.
-        name: of the log's file; `sha256`: its checksum, "" if it is not known.
+        model: settings that made the rows.
+        name: of the log's file.
+        sha256: checksum of the log's file, "" if unknown.
         duration: of the log [s].
-        excluded: rejected samples that were left out.
+        excluded: number of rejected samples.
         states: contact states of the log.
-        version: of torchid that compressed it.
-        payloads: what the robot carried, of which the rows are free; as settings.
-        noise_origins: of `model.noise` by group, as `GroupNoise` has them; "stated" of groups that are not in it.
+        version: of torchid that compressed the log.
+        payloads: known payloads, subtracted from the rows; as settings.
+        noise_origins: origin of `model.noise` by group, as in `GroupNoise`; "stated" for missing groups.
     """
 
     log: CompressedLog
@@ -385,9 +382,9 @@ _DESCRIPTION: TypeAdapter[_Description] = TypeAdapter(_Description)
 
 
 def write_factors(path: str | Path, factors: FactorFile) -> None:
-    """Write a compressed log, whole or not at all.
+    """Write a compressed log, completely or not at all.
 
-    From Python::
+    For example::
 
         model = torchid.RowModel.of(robot, builder, {"cutoff_hz": 8.0})
         torchid.write_factors("walk.factor", torchid.FactorFile(torchid.compress_log(log, builder), model))
@@ -413,31 +410,31 @@ def write_factors(path: str | Path, factors: FactorFile) -> None:
 
 
 def read_factors(path: str | Path) -> FactorFile:
-    """Read a compressed log; its name in a fit is that of the file.
+    """Read a compressed log.
 
-    From Python::
+    For example::
 
         logs = [torchid.read_factors(path).log for path in sorted(Path("factors").glob("*.factor"))]
         blocks = torchid.fold_compressed(logs, builder)
 
-    Whether its rows are those of a builder, `require_same_rows` and `require_same_noise` say.
+    Check with `require_same_rows` and `require_same_noise` whether the rows fit a builder.
 
     Args:
-        path: of the file.
+        path: of the file; it also names the log in a fit.
 
     Raises:
-        LogError: no such file, one of another format, or a damaged one.
+        LogError: the file does not exist, has another format, or is damaged.
     """
     path = Path(path)
     _require_suffix(path)
     if not os.path.isfile(path):
-        reason = "no such file" if not os.path.lexists(path) else "no regular file"
+        reason = "no such file" if not os.path.lexists(path) else "not a regular file"
         raise LogError(path, "file", reason, _ACCEPTED)
     with about_file(path), reader_errors_explained("file", _ACCEPTED), open_npz(path) as container:
         sizes = container.declared_bytes()
         check_unpacked_size(path, sum(sizes.values()), path)
         if sum(sizes.values()) > MAX_ARRAYS or sizes.get("description", 0) > MAX_DESCRIPTION:
-            raise ValueError("more bytes than a compressed log has")
+            raise ValueError("too large for a compressed log")
         return _read(path, container)
 
 
@@ -488,7 +485,7 @@ def _read(path: Path, container: Container) -> FactorFile:
     form = document.get("format") if isinstance(document, dict) else None
     if form != FORMAT:
         version = "none" if form is None else f"{excerpt(str(form))}, of another version of torchid"
-        raise LogError.at_field("format", version, f"{FORMAT}, as torchid {__version__} writes it")
+        raise LogError.at_field("format", version, f"{FORMAT} (torchid {__version__}); compress the log again")
     description = _DESCRIPTION.validate_json(text)
     require_comparable([*description.noise.values()])
     geometry = {name: _array(container, name, np.float64) for name in _GEOMETRY}
@@ -510,7 +507,7 @@ def _read(path: Path, container: Container) -> FactorFile:
 def _array(container: Container, name: str, dtype: type, dimensions: int | None = None) -> NDArray[Any]:
     array = container.load(name)
     if array.dtype != dtype or dimensions not in (None, array.ndim):
-        raise ValueError(f"{name} is no array of {dtype.__name__}")
+        raise ValueError(f"{name} is not an array of {dtype.__name__}")
     if array.dtype == np.float64 and not (np.abs(array) <= _LARGEST).all():
         raise ValueError(f"{name} has a number that is not finite")
     return array
@@ -529,11 +526,11 @@ def _log(source: str, description: _Description, values: Array) -> CompressedLog
     }
     parts.require_all_read()
     if not set(unloaded) <= {span for count in range(1, blocks + 1) for span in block_spans(samples, count)}:
-        raise ValueError("readings in the air of what is no block of the log")
+        raise ValueError("contact readings in the air outside the blocks of the log")
     if [part.samples for part in pieces] != [stop - start for start, stop in piece_spans(samples, blocks)]:
-        raise ValueError("pieces of other samples than those of the log")
+        raise ValueError("pieces with other samples than the log")
     if sum(part.samples for part in by_state) != samples or len({part.state for part in by_state}) != len(by_state):
-        raise ValueError("contact states of other samples than those of the log")
+        raise ValueError("contact states with other samples than the log")
     noise = description.oversampling, description.noise_left
     return CompressedLog(source, samples, *noise, blocks, pieces, by_state, unloaded)
 
@@ -585,11 +582,11 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
     """Read the compressed training logs of an experiment.
 
     Args:
-        experiment: whose training logs are files of factors.
+        experiment: its training logs are .factor files.
         on_read: called after each file.
 
     Raises:
-        LogError: a file that is damaged, or does not belong to the experiment or to the others.
+        LogError: a file is damaged, or does not fit the experiment or the other files.
         ConfigError: the experiment states other noise.
     """
     paths = experiment.config.logs.train
@@ -617,7 +614,7 @@ def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = 
 
 
 def with_choices_of(model: RowModel, experiment: Experiment) -> Experiment:
-    """The experiment with what `torchid compress` has chosen where it leaves that to the logs."""
+    """Take over the choices of `torchid compress` where the experiment leaves them to the logs."""
     settings = model.settings
     config = experiment.config
     labels = settings.get("actuators")
@@ -663,16 +660,16 @@ def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) 
     seen: dict[str, Path] = {}
     for path, file in zip(paths, files, strict=True):
         if file.sha256 and file.sha256 in seen:
-            reason = f"of the same log as {seen[file.sha256]} ({excerpt(file.name)})"
-            raise LogError(path, "sha256", reason, "factors of every log once")
+            reason = f"same log as {seen[file.sha256]} ({excerpt(file.name)})"
+            raise LogError(path, "sha256", reason, "each log once")
         seen[file.sha256] = path
 
 
 def _require_stated_noise(experiment: Experiment, model: RowModel, path: Path) -> None:
-    """Refuse an experiment that states other noise than factors were weighted with."""
+    """Raise ConfigError if an experiment states other noise than the factors were weighted with."""
     stated = NoiseGroups.of(experiment.robot).values(experiment.noise)
     for name, value in model.noise.items():
         if noise_key(name) in experiment.config.sensors.noise.forces and abs(value - stated[name]) > 1e-9 * value:
             reason = f"{stated[name]:g}, but {value:g} in {path}"
-            accepted = f"{value:g}, or no such key, or the logs compressed with another"
+            accepted = f"{value:g}, or remove this key, or compress the logs again"
             raise ConfigError.at_field(f"{NOISE}.{name}", reason, accepted)

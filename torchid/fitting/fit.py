@@ -107,7 +107,7 @@ class Fit:
 class LogFitter:
     """Fits compressed logs of one robot.
 
-    Without a command line, from logs that `bind_log` has tied to a robot::
+    For example, with logs from `bind_log`::
 
         builder = torchid.RowBuilder(robot, contacts, sensors)
         fitter = torchid.LogFitter(robot=robot, builder=builder, estimator=torchid.LeastSquares(ridge=1e-3))
@@ -116,11 +116,11 @@ class LogFitter:
 
     Attributes:
         robot: with the nominal parameters.
-        builder: of the rows; it knows contacts, sensors with their noise, and extra parameters.
-        estimator: finds the parameters, unless a method is given another `solve`.
+        builder: of the rows, with contacts, sensors, their noise, and extra parameters.
+        estimator: finds the parameters, unless a method gets another `solve`.
         friction: whether friction is fitted.
-        frozen: (12 L,) bool, parameters that keep their nominal values, from `frozen_parameters`; None for none.
-        masses: that are known.
+        frozen: (12 L,) bool, parameters that keep their nominal values, from `frozen_parameters`; or None.
+        masses: known masses.
     """
 
     robot: Robot
@@ -134,7 +134,7 @@ class LogFitter:
 
     @property
     def least_squares(self) -> LeastSquares:
-        """Least squares with the estimator's ridge and rank tolerance, for what needs no conditions."""
+        """Least squares with the estimator's ridge and rank tolerance, without conditions."""
         return LeastSquares(self.estimator.ridge, rank_tolerance=self.estimator.rank_tolerance)
 
     @one_thread()
@@ -142,9 +142,9 @@ class LogFitter:
         """Build the problem of compressed logs and solve it.
 
         Args:
-            parts: from `compress_in_blocks`, of this builder, or from `compress_parts`, whose only blocks are
-                folds: with fewer than three, standard errors rest on the assumption that residuals are noise.
-            solve: instead of the estimator's.
+            parts: from `compress_in_blocks` or `compress_parts` of this builder. The latter has folds as blocks; with
+                fewer than three, standard errors assume white residuals.
+            solve: replaces the estimator's.
         """
         fit = self.solve_problem(
             self.build_problem(merge(parts, self.builder, "source", "state", "fold", "unloaded")), solve
@@ -154,10 +154,10 @@ class LogFitter:
         return fit if jackknife is None else with_block_errors(fit, jackknife)
 
     def assemble(self, parts: Sequence[Part], reading_noise: Mapping[int, float] | None = None) -> Assembly:
-        """The problem of compressed logs as they are, with extra parameters eliminated and frozen ones not free.
+        """Build the problem of compressed logs, with extra parameters eliminated and frozen ones fixed.
 
-        Masses that are known are further rows of it. Where scales make up all of the forces and no mass is known, the
-        nominal total mass stands in for one: the best fit were no forces at all. `reading_noise`: as `Assembly` has it.
+        Known masses are further rows. If unknown scales multiply all measured forces and no mass is known, the nominal
+        total mass counts as known; otherwise zero forces would be the best fit. `reading_noise`: as in `Assembly`.
         """
         assembly = assemble(parts, self.builder, self.robot, self.friction, reading_noise)
         problem = assembly.problem
@@ -180,10 +180,10 @@ class LogFitter:
         return replace(assembly, problem=problem, if_known=known, **known_of)  # type: ignore[arg-type]
 
     def build_problem(self, parts: Sequence[Part]) -> LogProblem:
-        """The problem of compressed logs, readings of contact sensors in the air weighted by their own noise.
+        """Build the problem of compressed logs; contact readings in the air are weighted by their own noise.
 
-        A first least-squares fit shows by how much all other rows miss the stated noise, and so how large the noise of
-        readings with unknown scales is: fit and noise take turns.
+        A first least-squares fit shows by how much the rows differ from the stated noise. Fit and noise estimate
+        alternate, because the noise of readings with unknown scales depends on the fit.
         """
         problem = LogProblem(list(parts), self.assemble(parts))
         if any(part.unloaded for part in parts):
@@ -202,7 +202,7 @@ class LogFitter:
         return problem
 
     def _reading_noise(self, problem: LogProblem) -> dict[int, float]:
-        """What `Assembly` has under this name: the mean square residual but for noise of the motion, per squared scale.
+        """Value of `Assembly.reading_noise`: mean square residual without motion noise, per squared scale.
 
         Rows are weighted with the noise of forces, which is that of readings times their scales.
         """
@@ -221,7 +221,7 @@ class LogFitter:
         return {column: variance / max(scale, _LEAST_SCALE) ** 2 for column, scale in scales}
 
     def solve_problem(self, problem: LogProblem, solve: Solve | None = None) -> Fit:
-        """Solve what `build_problem` has built; `solve` instead of the estimator's."""
+        """Solve a problem from `build_problem`; `solve` replaces the estimator's."""
         assembly = problem.assembly
         estimate = (solve or self.estimator.solve)(assembly.problem)
         extras = estimate_extras(assembly, estimate, self.robot.body_names, self.estimator.rank_tolerance)
@@ -248,15 +248,15 @@ def with_block_errors(fit: Fit, jackknife: Jackknife, factor: float = 1.0) -> Fi
 
 
 def frozen_parameters(robot: Robot, bodies: Collection[str], field: str = "frozen") -> np.ndarray:
-    """Parameters of some bodies, (12 L,) bool, that are to keep their nominal values.
+    """Mask of the parameters of bodies, (12 L,) bool, that keep their nominal values.
 
     Args:
         robot: the robot.
         bodies: names of the bodies.
-        field: that names them, for the error.
+        field: names the setting in an error.
 
     Raises:
-        UnknownNameError: a body that the robot does not have.
+        UnknownNameError: the robot has no such body.
     """
     frozen = np.zeros((len(robot.bodies), PER_BODY), dtype=bool)
     for name in bodies:
@@ -267,9 +267,9 @@ def frozen_parameters(robot: Robot, bodies: Collection[str], field: str = "froze
 
 
 def _with_own_noise(part: Part, residual_std: float) -> Part:
-    """A part whose readings in the air keep the noise that they show, where all others have more than is stated.
+    """A part whose readings in the air keep their own noise, although all other rows exceed the stated noise.
 
-    What accelerations and models get wrong on the ground says nothing of a sensor that nothing touches.
+    Errors of accelerations and of the model on the ground do not affect a sensor in the air.
     """
     if not part.unloaded or residual_std <= 1.0:
         return part
@@ -294,18 +294,18 @@ ExtraValues = Mapping[tuple[str, str], float]
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Parameters of the bodies with the extra parameters that fit them best, known or fitted anew to every new log.
+    """Parameters of the bodies with extra parameters of sensors and actuators, known or fitted for each new log.
 
-    Readings of other logs of the same robot, as calibrated sensors would have recorded them::
+    It corrects the readings of other logs of the same robot to those of calibrated sensors::
 
         calibration = torchid.calibrations(fit, robot, builder).identified
-        corrected = calibration.calibrate(new_logs)  # offsets of each log are fitted, scales of all logs are known
+        corrected = calibration.calibrate(new_logs)  # offsets are fitted for each log, scales of all logs are known
 
     Attributes:
         robot: the robot.
-        builder: of the rows of the sensors and actuators whose extra parameters are meant.
+        builder: of the rows; it has the extra parameters.
         phi: (12 L,), parameters of the bodies.
-        values: the extra parameters that are known.
+        values: the known extra parameters.
     """
 
     robot: Robot
@@ -328,14 +328,14 @@ class Calibration:
         return [(x, self.values["", x.label]) for x in extras if ("", x.label) in self.values]
 
     def calibrate(self, logs: Sequence[Samples], step: int = 1) -> list[Samples]:
-        """The logs with calibrated readings; extra parameters of a new log are fitted to it first, to all its samples.
+        """Correct the readings of logs. Extra parameters of a new log are fitted first, to all its samples.
 
         Args:
             logs: as recorded.
-            step: every `step`-th sample of each comes back.
+            step: return every `step`-th sample.
 
         Warns:
-            TorchidWarning: a new log lacks sensors, so that its readings are taken as they are.
+            TorchidWarning: a new log lacks sensors, so its readings are not corrected.
         """
         if not self.changes_readings:
             return [log.every(step) for log in logs]
@@ -357,7 +357,7 @@ class Calibration:
         return builder if builder.device.type == "cpu" else copy.deepcopy(builder).to(torch.device("cpu"))
 
     def _known(self, extras: Sequence[Extra], log: str) -> Array:
-        """Values of extra parameters of a log and of all logs, 0 where none is known."""
+        """Known extra parameters of a log and of all logs, 0 for unknown ones."""
         return np.array([self.values.get((log if x.per_log else "", x.label), 0.0) for x in extras])
 
     def _values_for(self, log: Block) -> Array:
@@ -390,12 +390,12 @@ class Calibration:
 
 
 def calibrations(fit: Fit, robot: Robot, builder: RowBuilder) -> Comparison[Calibration]:
-    """Nominal and identified parameters, each with the extra parameters that the logs of a fit show for them.
+    """Nominal and identified parameters, each with the best extra parameters for the logs of a fit.
 
     Args:
         fit: of compressed logs.
         robot: the robot.
-        builder: of their rows.
+        builder: of the rows.
     """
     return calibrations_at(fit.assembly, Minimizer(fit.estimate.phi, fit.estimate.psi), robot, builder)
 
@@ -433,7 +433,7 @@ _NAMED_IN_SHORT = 2
 
 
 def warn_of_confounded(extras: Sequence[ExtraEstimate]) -> None:
-    """Name sensors whose offset or scale, in the extra parameters of a fit, is confounded with other parameters.
+    """Warn about offsets and scales that are confounded with other parameters.
 
     Warns:
         ConfoundedWarning: one for each log that has some.
@@ -448,9 +448,9 @@ class Confounded:
     """Extra parameters that the data do not separate from others.
 
     Attributes:
-        log: that they are of, "" for all.
-        extras: their labels.
-        confounded_with: the others: "total mass" if stating this would do, else parameters of bodies.
+        log: name of the log, "" for all logs.
+        extras: labels.
+        confounded_with: "total mass" if stating it would separate them, else parameters of bodies.
         advice: what would separate them.
     """
 
@@ -465,7 +465,7 @@ class Confounded:
 
     @property
     def in_short(self) -> str:
-        """What to do, before what it is good for, without what they are confounded with."""
+        """The advice first, then the parameters not to trust."""
         return f"{self.advice}; until then do not trust {_grouped(self.extras, _NAMED_IN_SHORT)}"
 
 
@@ -487,22 +487,20 @@ def list_confounded(extras: Sequence[ExtraEstimate]) -> list[Confounded]:
 
 
 def _advice(extras: Sequence[ExtraEstimate], by_mass: bool) -> str:
-    """What would separate extra parameters from what they are confounded with."""
+    """Advice that separates extra parameters from other parameters."""
     kinds = {x.extra.what for x in extras}
     if by_mass:
-        return "state estimator.total_mass" + (", or leave a sensor out of scales" if kinds == {"scale"} else "")
+        return "state estimator.total_mass" + (", or remove a sensor from scales" if kinds == {"scale"} else "")
     if kinds == {"scale"}:
-        return (
-            "add motion, state a known mass (estimator.total_mass, estimator.masses), or leave a sensor out of scales"
-        )
+        return "add motion, state a known mass (estimator.total_mass, estimator.masses), or remove a sensor from scales"
     terms = [f"actuators.{kind}" for kind in ACTUATORS if kind in kinds]
     if terms:
-        return f"add motion, or leave out {' and '.join(terms)}"
-    return "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
+        return f"add motion, or remove {' and '.join(terms)}"
+    return "add motion that unloads the sensor, state known masses, or zero the sensor before recording"
 
 
 def warn_of_masked(parts: Sequence[Part], builder: RowBuilder) -> None:
-    """Name contact sensors whose readings in the air say nothing of their offsets.
+    """Warn about contact sensors whose readings in the air do not determine their offsets.
 
     Warns:
         TorchidWarning: one for each log that has some.
@@ -512,12 +510,11 @@ def warn_of_masked(parts: Sequence[Part], builder: RowBuilder) -> None:
         if masked:
             channels = (builder.extras[number] for number in sorted(masked))
             named = _grouped(f"{x.name} {x.component}" for x in channels)
-            message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
-            warn(f"{message}, which says nothing of their offsets")
+            warn(f"{log}: {named} read exactly 0 in the air (masked or clamped) and show no offsets there")
 
 
 def _grouped(labels: Iterable[str], most: int = _NAMED) -> str:
-    """So many labels by sensor or body, the most frequent first: "scale of l_hip, r_hip; m, mcx of pelvis"."""
+    """Up to `most` labels by sensor or body, the most frequent first: "scale of l_hip, r_hip; m, mcx of pelvis"."""
     groups: dict[str, dict[str, None]] = {}
     for label in labels:
         first, _, last = label.rpartition(" ")

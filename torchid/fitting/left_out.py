@@ -238,13 +238,13 @@ def compress_reading(
 
 
 def _eliminated(gram: Array, unknown: Sequence[int], kept: Sequence[int]) -> Array:
-    """What is left of a Gram matrix where unknowns of its log alone are at their best."""
+    """A Gram matrix without the unknowns of its log, at their best values."""
     across = gram[np.ix_(unknown, kept)]
     return np.asarray(gram[np.ix_(kept, kept)] - across.T @ np.linalg.pinv(gram[np.ix_(unknown, unknown)]) @ across)
 
 
 def thinned(logs: Sequence[Samples], count: int = SAMPLES) -> list[Samples]:
-    """About so many samples of all logs, evenly spaced, with the rate of the torques as the column of a delay."""
+    """About this many evenly spaced samples of all logs; `slope` is the rate of the torques (column of a delay)."""
     step = max(1, sum(map(len, logs)) // count)
     out = []
     for log in logs:
@@ -325,16 +325,16 @@ class Evidence:
 def leave_sensors_out(
     logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms, sets: Mapping[str, SensorSet]
 ) -> dict[str, Evidence]:
-    """By how much better a fit with fewer sensors predicts the left-out rows of these than a fit with all does.
+    """Gain in the prediction of the remaining rows when sensors are left out of the fit.
 
-    Both are judged by the same rows, those that need none of the sensors left out: where they gain by leaving a sensor
-    out, it contradicts the others.
+    Both fits are judged on the same rows: those of the smaller sensor set. A gain means that the left-out sensor
+    contradicts the others.
 
     Args:
         logs: bound training logs.
         fitter: of the rows of all sensors.
-        terms: extra parameters of these.
-        sets: parts of these sensors, by name.
+        terms: extra parameters of all sensors.
+        sets: smaller sensor sets, by name.
 
     Source: sensors that make predictions worse, Mistry, Schaal, Yamane 2009, IV-E; the score is that of `choose_terms`.
     """
@@ -353,9 +353,9 @@ def leave_sensors_out(
 
 @dataclass(frozen=True)
 class TermsChoice:
-    """Terms of actuators that left-out blocks ask for, and what each is worth there.
+    """Actuator terms that reduce the error on left-out blocks, with the evidence for each.
 
-    `adopted`: by name, the evidence against a fit without it. `rejected`: likewise, that for a fit with it as well.
+    `adopted`: by name, the gain over a fit without the term. `rejected`: the gain of a fit with the term in addition.
     """
 
     adopted: Mapping[str, Evidence]
@@ -367,7 +367,7 @@ class TermsChoice:
             ", ".join(f"{in_words(name)} {evidence}" for name, evidence in x.items()) for x in (self.adopted, near)
         )
         suffix = " (error on left-out blocks)" * bool(named or misses)
-        return (named or "none") + (f"; near misses: {misses}" if misses else "") + suffix
+        return (named or "none") + (f"; almost adopted: {misses}" if misses else "") + suffix
 
 
 def choose_terms(reading: Reading, candidates: Sequence[str], fixed: Collection[str] = ()) -> TermsChoice:
@@ -409,15 +409,14 @@ def choose_terms(reading: Reading, candidates: Sequence[str], fixed: Collection[
 
 
 def widest(readings: Sequence[Reading], terms: Collection[str]) -> int:
-    """Of readings, each part of the one before, the first whose fit no later one's fit outdoes.
+    """Of readings, each a subset of the one before, the first one that no later one predicts better than.
 
-    One outdoes another if it predicts left-out blocks of both readings clearly better, as the product of their squared
-    errors says: what disturbs a wider band, or the samples beside touch-downs, spoils a fit for data that are free of
-    it, and such a fit gains little where the disturbance is.
+    A reading is better if its fit predicts left-out blocks of both readings clearly better, by the product of their
+    squared errors. Disturbances in a wider band, or beside touch-downs, also spoil the fit for clean data.
 
     Args:
         readings: of the same blocks, the widest first.
-        terms: kinds of the extra parameters that are fitted.
+        terms: kinds of the fitted extra parameters.
     """
     # a filter that takes off twice the noise also makes twice as many samples say the same: the prior weighs alike
     ridges = [RIDGE * reading.oversampling / readings[0].oversampling for reading in readings]
@@ -454,7 +453,7 @@ def with_all_readings(log: Samples, builder: RowBuilder) -> Samples:
 
 @dataclass(frozen=True)
 class ResidualSquares:
-    """Sums of squares of whitened rows: of their residuals, of what was measured, and of the noise a filter leaves."""
+    """Sums of squares of whitened rows: residuals, measurements, and the noise that the filter keeps."""
 
     error: float
     measured: float
@@ -496,9 +495,9 @@ Of a filtered log one in `oversampling` has the whole band of the errors' square
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Errors on every block of the training logs of what was fitted without it: `folds` fits, blocks pooled.
+    """Errors on every block of the training logs, predicted by fits without this block (`folds` fits, blocks pooled).
 
-    `nominal`: of the URDF's parameters on the same blocks.
+    `nominal`: the errors of the URDF's parameters on the same blocks.
     """
 
     folds: int
@@ -508,9 +507,10 @@ class CrossValidation:
 
 @dataclass(frozen=True)
 class RidgeChoice:
-    """A ridge, and mean squares of whitened residuals on held-out folds by ridge; errors of differences from the best.
+    """The chosen ridge, with mean squared whitened residuals on held-out folds for each ridge.
 
-    `rule`: which of those within one standard error of the least mean square was taken, the smallest or the largest.
+    `standard_error`: of the differences from the best ridge. `rule`: "auto" takes the smallest ridge within one
+    standard error of the best, "one_standard_error" the largest.
     """
 
     ridge: float
@@ -522,23 +522,23 @@ class RidgeChoice:
     def __str__(self) -> str:
         if self.rule == "one_standard_error":
             return f"{self.ridge:g}, the largest within one standard error of the best on left-out blocks"
-        stronger = "" if self.ridge == self.tried[0] else "; left-out blocks ask for more than usual"
-        return f"{self.ridge:g}, by the size of the residuals{stronger}"
+        stronger = "" if self.ridge == self.tried[0] else ", raised by cross-validation"
+        return f"{self.ridge:g}, from the size of the residuals{stronger}"
 
 
 @one_thread()
 def cross_validate(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms | None = None) -> CrossValidation:
-    """Errors of predicted forces on blocks of some logs, each block predicted by the fit of all others.
+    """Errors of predicted forces on blocks of logs; each block is predicted by the fit of all others.
 
-    Blocks are contiguous in time, see `split_into_folds`: errors of successive samples are alike::
+    Blocks are contiguous in time, see `split_into_folds`, because successive errors are correlated::
 
         errors = torchid.cross_validate(logs, fitter)
         errors.identified.rms["joint_torque"], errors.nominal.rms["joint_torque"]  # [N m]
 
     Args:
         logs: bound logs.
-        fitter: of their rows.
-        terms: the extra terms of the fitter's builder.
+        fitter: of the rows.
+        terms: extra terms of the fitter's builder.
 
     Raises:
         LogError: too few samples to leave some out.
@@ -556,11 +556,13 @@ def cross_validate(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms
 
 @one_thread()
 def calibrations_without_folds(fit: Fit | LogProblem, fitter: LogFitter) -> list[Comparison[Calibration]]:
-    """For every fold of a fit, in order, nominal parameters and those of all others; none where there is only one.
+    """For every fold of a fit, in order: nominal parameters, and those of a fit without the fold.
+
+    Empty for a single fold.
 
     Args:
-        fit: whose blocks keep the weights and the noise of readings that they have.
-        fitter: that it comes from.
+        fit: its blocks keep their weights and noise of readings.
+        fitter: of the fit.
     """
     folds = sorted({part.fold for part in fit.parts})
     if len(folds) < 2:
@@ -587,23 +589,24 @@ def choose_ridge(
     done: Callable[[int], None] | None = None,
     rule: RidgeRule = "auto",
 ) -> RidgeChoice:
-    """The smallest ridge, or the largest, within one standard error of the least error on held-out folds.
+    """Choose the smallest (or largest) ridge whose error on held-out folds is within one standard error of the least.
 
-    Source: Hastie, Tibshirani, Friedman, "The Elements of Statistical Learning", 7.10; here with the standard error of
-    the difference, fold by fold::
+    The standard error is that of the difference, fold by fold. For example::
 
         blocks = torchid.split_into_folds(logs, builder)
         parts = torchid.compress_parts(blocks, builder)
         estimators = [torchid.LeastSquares(ridge) for ridge in torchid.RIDGES]
         torchid.choose_ridge(parts, blocks, fitter, estimators).ridge
 
+    Source: Hastie, Tibshirani, Friedman, "The Elements of Statistical Learning", 7.10.
+
     Args:
         parts: of the blocks, compressed.
-        blocks: training logs, as `split_into_folds` or `fold_compressed` cuts them.
-        fitter: of their rows.
+        blocks: training logs from `split_into_folds` or `fold_compressed`.
+        fitter: of the rows.
         estimators: one for each ridge to try, ascending.
         done: called with the number of fits done.
-        rule: which of them is taken.
+        rule: "auto" for the smallest, "one_standard_error" for the largest.
 
     Raises:
         LogError: too few samples to leave some out.
@@ -658,15 +661,15 @@ def _held_out_squares(
 
 
 def _too_few(logs: Sequence[Block]) -> LogError:
-    reason = "the training samples are too few to leave blocks of them out"
+    reason = "too few training samples to leave blocks out"
     return LogError(logs[0].source if logs else "logs", "samples", reason, "longer logs")
 
 
 @dataclass(frozen=True)
 class Scorer:
-    """Errors of parameters on logs: `evaluation` predicts forces, `builder` makes the rows of a fit.
+    """Computes errors of parameters on logs: `evaluation` predicts forces, `builder` makes the rows of a fit.
 
-    `most`: samples of training logs whose forces are predicted at most; of filtered ones `ENOUGH_SCORED` are enough.
+    `most`: largest number of training samples for force errors; `ENOUGH_SCORED` suffice for filtered logs.
     """
 
     evaluation: Evaluation
@@ -690,13 +693,13 @@ class Scorer:
         parts: Sequence[Part] | None = None,
         progress: ProgressCallback | None = None,
     ) -> list[Metrics]:
-        """Errors on logs of some parameters, each with the extra parameters that fit them best.
+        """Errors of parameters on logs, each with its best extra parameters.
 
         Args:
             logs: bound; compressed ones give only the whitened projected residual.
             compared: parameters for the logs of each fold.
-            parts: training logs, compressed with the weights of the fit: every k-th sample of them is evaluated; None
-                for logs as recorded, of which rows of the fit's sensors count where a log has all their readings.
+            parts: training logs, compressed with the weights of the fit; every k-th sample is evaluated. None for other
+                logs, whose rows count if a log has all readings of the fit's sensors.
             progress: called with the number of samples done.
         """
         whole = [log for log in logs if isinstance(log, Samples)]
@@ -722,14 +725,14 @@ class Scorer:
         without_folds: Sequence[Comparison[Calibration]],
         progress: ProgressCallback | None = None,
     ) -> tuple[Comparison[Metrics], CrossValidation | None]:
-        """Errors of the fit on the training logs, and of fits without a fold each on that fold, in one pass.
+        """Errors on the training logs of the fit, and of fits without a fold on this fold, in one pass.
 
         Args:
-            logs: as `split_into_folds` or `fold_compressed` has cut them.
-            parts: as of `score`.
+            logs: from `split_into_folds` or `fold_compressed`.
+            parts: as in `score`.
             compared: parameters of the fit.
-            without_folds: those of a fit without each fold, by its number; none without cross-validation.
-            progress: called with the number of samples done, of those that are `scored`.
+            without_folds: parameters of a fit without each fold, by its number; empty without cross-validation.
+            progress: called with the number of `scored` samples done.
         """
         first = 0 if self.builder.extras else 1  # nominal parameters differ between fits by extra parameters alone
         by_fold: dict[int, Sequence[Calibration]] = {

@@ -1,7 +1,4 @@
-"""The noise that rows are weighted with, stated or estimated, and whether a fit leaves more than it.
-
-Friction that was not fitted is what it lacks most often: `unfitted_friction` tells it from other residuals.
-"""
+"""The noise that weights the rows, stated or estimated, and whether a fit leaves more residual than this noise."""
 
 from __future__ import annotations
 
@@ -47,12 +44,12 @@ _APART = 2.0  # where a standard deviation is half of what it should be, 95 % in
 
 @dataclass(frozen=True)
 class GroupNoise:
-    """Noise of a joint's torque, of other readings, or of base rows along an axis of the levelled base.
+    """Noise of a joint torque, of other readings, or of base rows along an axis of the levelled base.
 
-    `origin`: "stated", "estimated", "pooled" (residuals do not tell it from that of the other joints, and all are taken
-    together), "at most" (drowned in other noise: an upper bound), "confounded" (residuals show little but its sum with
-    other noise) or "assumed" (too few readings). `used`: standard deviation that rows were weighted with; `residual`:
-    that of the residuals, None if they do not determine it, or nobody has looked.
+    `origin`: "stated", "estimated", "pooled" (estimated together with the other joints, because residuals do not
+    separate them), "at most" (an upper bound, because other noise is much larger), "confounded" (residuals determine
+    only its sum with other noise) or "assumed" (too few readings). `used`: standard deviation that weighted the rows.
+    `residual`: that of the residuals; None if unknown.
     """
 
     group: str
@@ -64,10 +61,10 @@ class GroupNoise:
 
 @dataclass(frozen=True)
 class NoiseSummary:
-    """What rows were weighted with.
+    """The noise that weighted the rows.
 
-    `groups`: those that the sensors have. `suggested`: keys of `sensors.noise` with what residuals show instead of
-    what is stated, empty where they do not contradict it. `passes`: fits of a sample of the logs that it took.
+    `groups`: of the sensors. `suggested`: keys of `sensors.noise` with values from the residuals, if these contradict
+    the stated ones. `passes`: number of fits to a subset of the samples.
     """
 
     noise: SensorNoise
@@ -95,11 +92,11 @@ def estimate_noise(
     stated: Collection[str] = (),
     suggest: bool = True,
 ) -> NoiseSummary:
-    """The noise of sensors, by fits of a sample of the logs that are weighted again until the noise settles.
+    """Estimate the noise of sensors by repeated fits to a subset of the samples, until the noise does not change.
 
-    Where scales make up all of the forces, residuals say nothing, and the guess is kept.
-    Where some noise is stated and some not, the stated one counts as right but for a common factor: a filter leaves
-    less of it than was recorded. What is estimated is given in the same proportion::
+    If unknown scales multiply all forces, residuals do not show the noise, and the initial guess is kept. If only some
+    noise is stated, the stated values count as right up to a common factor, because the filter removes noise. Estimated
+    values are given in the same proportion::
 
         summary = torchid.estimate_noise(logs, fitter, stated=["joint_torque"])
         summary.noise  # a SensorNoise, [N m] and [N]
@@ -107,10 +104,10 @@ def estimate_noise(
     Source: variance components by iterated minimum norm estimation, see `torchid.problem.noise`.
 
     Args:
-        logs: bound training logs; of processes that share the work each may have some of them.
-        fitter: of their rows; its sensors have the stated noise, and a guess where none is stated.
+        logs: bound training logs; processes that share the work may each have some of them.
+        fitter: of the rows; its sensors have the stated noise, and a guess where none is stated.
         stated: fields of `SensorNoise` that are stated.
-        suggest: whether to find what residuals show of what is stated; without it, nothing is fitted if all is.
+        suggest: whether to check stated values too; if False and all noise is stated, nothing is fitted.
     """
     builder = fitter.builder
     guess = fitter.builder.sensors.noise
@@ -153,7 +150,7 @@ def estimate_noise(
 
 
 def mean_noise_square(logs: Sequence[Samples], builder: RowBuilder) -> float:
-    """Mean square that the builder's noise leaves rows of a sample of the logs: 1 but for task weights."""
+    """Mean square of pure noise in the rows of a subset of the samples: 1 without task weights."""
     noise = [chunk.sources.square().sum(1) for chunk in SampledRows(logs, builder).chunks]
     return float(sum(x.sum() for x in noise) / max(sum(x.count_nonzero() for x in noise), 1))
 
@@ -161,7 +158,7 @@ def mean_noise_square(logs: Sequence[Samples], builder: RowBuilder) -> float:
 def recorded_sensors(
     robot: Robot, contacts: Sequence[Contact], logs: Sequence[Samples], noise: SensorNoise | None = None
 ) -> SensorSet:
-    """All sensors whose every value is in every log; `contacts`: the contacts in use."""
+    """All sensors with a value in every sample of every log; `contacts`: the contacts in use."""
     torque = np.ones(robot.n_dofs, dtype=bool)
     wrench = np.ones((len(contacts), 6), dtype=bool)
     for log in logs:
@@ -255,18 +252,17 @@ AT_THE_FLOOR = 1.3
 
 @dataclass(frozen=True)
 class Misfit:
-    """What a fit leaves of the forces, and what noise alone would leave.
+    """Residual of a fit, compared with the noise.
 
     Attributes:
         residual: standard deviation of the whitened residuals.
-        expected: the same if the stated noise and the filter were all there is; None where no noise is stated, as
-            residuals say what noise there is.
-        lack_of_fit: as `Jackknife` has it, None where blocks are too few.
-        error_growth: median over the identified parameters of the standard error by the scatter between blocks over
-            that by noise, None likewise.
-        groups: of readings and base rows that exceed their noise most.
-        friction: that was not fitted, None where all of it was.
-        share: residual over that of the nominal parameters, None where these leave nothing.
+        expected: the same for the stated noise after the filter; None without stated noise.
+        lack_of_fit: as in `Jackknife`; None with too few blocks.
+        error_growth: median over the identified parameters of the standard error from the scatter between blocks,
+            divided by that from noise; None with too few blocks.
+        groups: readings and base rows that exceed their noise most.
+        friction: friction that was not fitted; None if all was fitted.
+        share: residual divided by that of the nominal parameters; None if the latter is 0.
     """
 
     residual: float
@@ -290,23 +286,23 @@ class Misfit:
 
     @property
     def explained(self) -> bool:
-        """Whether noise may be all that the model leaves."""
+        """Whether noise can explain the whole residual."""
         return not self._reasons()
 
     def _reasons(self) -> list[str]:
-        """Why noise cannot be all that the model leaves, none where it may be."""
+        """Reasons why noise cannot explain the residual; empty if it can."""
         reasons = []
         if self.expected is not None and self.residual > _MUCH * self.expected:
-            reasons.append(f"residuals are {self.residual / self.expected:.2g} times what the stated noise leaves")
+            reasons.append(f"residuals are {self.residual / self.expected:.2g} times as large as the stated noise")
         if self.alike:
             reasons.append(
-                f"residuals are correlated in time, between blocks {self.lack_of_fit:.2g} times noise's variance"
+                f"residuals are not white (their block variance is {self.lack_of_fit:.2g} times that of noise)"
             )
         return reasons + [str(self.friction)] * (self.friction is not None and self.friction.significant)
 
     @property
     def in_short(self) -> str:
-        """The first reason and the readings that show it most, "" where the model explains the forces."""
+        """The first reason and the sensor group that shows it most; "" if the model explains the forces."""
         where = f", most in {self.groups[0].group}" if self.groups else ""
         return "".join(f"{reason}{where}" for reason in self._reasons()[:1])
 
@@ -317,7 +313,7 @@ class Misfit:
             return ""
         share = self.expected or 1.0
         shown = [
-            f"{group.group} {group.residual:.2g} {group.unit} where {share * group.used:.2g} are expected"
+            f"{group.group} {group.residual:.2g} {group.unit} (expected {share * group.used:.2g})"
             for group in self.groups
             if group.residual is not None
         ]
@@ -332,13 +328,13 @@ def misfit(
     jackknife: Jackknife | None,
     friction: UnfittedFriction | None,
 ) -> Misfit:
-    """What a fit leaves of the forces.
+    """Compare the residual of a fit with the noise.
 
     Args:
         estimate: of the training logs.
-        noise: that rows were weighted with.
-        logs: these logs.
-        jackknife: of the estimate over blocks of them.
+        noise: that weighted the rows.
+        logs: the training logs.
+        jackknife: of the estimate over their blocks.
         friction: that was not fitted.
     """
     noise_left = np.average([log.noise_left for log in logs], weights=[len(log) for log in logs])
@@ -363,7 +359,7 @@ def misfit(
 
 
 def beyond_noise(estimate: Estimate) -> str:
-    """That a fit leaves far more than the stated noise, far more than a `Misfit` says; "" where it does not."""
+    """Message if the residual is very far above the stated noise; "" otherwise."""
     residual = _residual(estimate)
     reason = f"forces differ from any rigid-body model by {residual:.3g} times the stated sensor noise"
     return reason if residual > _UNEXPLAINED else ""
@@ -372,20 +368,20 @@ def beyond_noise(estimate: Estimate) -> str:
 def unexplained_forces(
     estimate: Estimate, problem: LinearProblem, forces: float = 0.0, noise_stated: bool = True
 ) -> str:
-    """That a fit leaves most of the weighted forces, and no stated noise makes them; "" where it does not.
+    """Message if a fit does not explain most of the weighted forces, and stated noise does not either; "" otherwise.
 
     Args:
-        estimate: of a fit, which may be far from the best.
+        estimate: of a fit, possibly far from the optimum.
         problem: that was solved.
-        forces: squared norm of the weighted forces, if offsets and scales that were eliminated have taken some of it.
-        noise_stated: whether a user has stated noise. One that is estimated is that of most readings: a lift that
-            carries 200 N beside wrists of 0.05 N m leaves many times as much.
+        forces: squared norm of the weighted forces, if eliminated offsets and scales have taken some of it.
+        noise_stated: whether the user stated noise. Estimated noise is that of most readings: a lift that carries 200 N
+            beside wrists of 0.05 N m leaves many times as much.
     """
     forces = max(problem.cost(np.zeros_like(estimate.phi)), forces, np.finfo(float).tiny)
     share = np.sqrt(estimate.cost / forces)
     if share <= _SHARE or (noise_stated and _residual(estimate) <= _MUCH):
         return ""
-    return f"the fit leaves {100.0 * share:.3g} % of the weighted forces"
+    return f"the fit does not explain {100.0 * share:.3g} % of the weighted forces"
 
 
 def _residual(estimate: Estimate) -> float:
@@ -418,11 +414,11 @@ def force_gain(problem: LinearProblem) -> float | None:
 
 
 def unexplained_torques(fitted: Metrics, sensors: SensorSet | None = None) -> str:
-    """That a fit leaves most of the joint torques, however well it explains other forces; "" where it does not.
+    """Message if a fit does not explain most of the joint torques; "" otherwise.
 
-    Of all torques, or of what no contact has a part in. Noise of the readings, where it is known, explains what it may.
-    Where the `sensors` of the fit are given, of what they read alone: nothing where they read no torque, as friction is
-    not fitted then, and without any wrench what no contact has a part in.
+    It judges all torques, or the projected rows without contact forces. Known sensor noise is subtracted. With
+    `sensors`, only what they measure counts: nothing without torque sensors (friction is then not fitted), and only the
+    projected rows without contact sensors.
     """
     groups = ["joint_torque", "nullspace"]
     unread = sensors is not None and sensors.wrench.size > 0 and not sensors.wrench.any()
@@ -433,13 +429,13 @@ def unexplained_torques(fitted: Metrics, sensors: SensorSet | None = None) -> st
     noise = AT_THE_FLOOR * (fitted.noise.get("joint_torque") or 0.0)  # as large where projected on orthonormal axes
     beyond = (group for group in groups if (fitted.rms_of(group) or 0.0) > noise)
     share = max((fitted.relative_of(group) or 0.0 for group in beyond), default=0.0)
-    return f"the fit leaves {100.0 * share:.3g} % of the joint torques" if share > _SHARE else ""
+    return f"the fit does not explain {100.0 * share:.3g} % of the joint torques" if share > _SHARE else ""
 
 
 def unexplained_joints(fitted: Metrics) -> list[str]:
-    """Joints of whose torque a fit leaves a large part that is no small force, nor the noise of readings where known.
+    """Joints with a large unexplained torque that is neither a small force nor known sensor noise.
 
-    Noise that is estimated from residuals takes a joint that the model does not explain for a noisy one.
+    Noise estimated from residuals would take a joint that the model does not explain for a noisy one.
     """
     torques = {
         name: (error, error / share)
@@ -460,14 +456,14 @@ _NAMED_JOINTS = 2
 
 @dataclass(frozen=True)
 class UnfittedFriction:
-    """What friction that was not fitted would explain of the residuals.
+    """How much of the residual friction would explain that was not fitted.
 
     Attributes:
-        joints: that it was not fitted of, those whose forces show it most clearly first.
+        joints: without fitted friction, those with the clearest evidence first.
         values: friction beyond the nominal one, (len(joints), 2), Coulomb and viscous.
         units: of both, by joint.
-        ratio: squares that it explains over those that it would explain of noise; about 1 without friction.
-        combinations: of its parameters that the rows tell from all that was fitted.
+        ratio: explained squares divided by those expected from noise; about 1 without friction.
+        combinations: number of friction parameter combinations that the rows separate from the fitted parameters.
     """
 
     joints: tuple[str, ...]
@@ -478,29 +474,29 @@ class UnfittedFriction:
 
     @property
     def significant(self) -> bool:
-        """Whether noise would explain as much in fewer than one of a thousand fits.
+        """Whether noise would explain as much in less than one of a thousand fits.
 
-        Source: the F test of linear hypotheses, of many degrees of freedom of noise.
+        Source: the F test of linear hypotheses, for many degrees of freedom of noise.
         """
         if not self.combinations:
             return False
         return self.ratio > max(_FRICTION_RATIO, float(chdtri(self.combinations, _LEVEL)) / self.combinations)
 
     def __str__(self) -> str:
-        """How much it explains, and of which joints most."""
+        """How much it explains, and the joints with the clearest evidence."""
         shown = [
             f"{joint} {coulomb:.2g} {units[0]} and {viscous:.2g} {units[1]}"
             for joint, (coulomb, viscous), units in zip(self.joints, self.values, self.units, strict=True)
         ]
         named = ", ".join(shown[:_NAMED_JOINTS])
-        return f"friction, which is not fitted, explains {self.ratio:.2g} times as much as it would of noise ({named})"
+        return f"friction, which is not fitted, explains {self.ratio:.2g} times as much as noise would ({named})"
 
 
 @one_thread()
 def unfitted_friction(problem: LinearProblem, robot: Robot) -> UnfittedFriction | None:
-    """The friction that a fit of a problem has left nominal and its rows show; None where no row shows any.
+    """Friction in the residuals that a fit kept nominal; None if no row depends on it.
 
-    Friction of joints whose bodies are frozen is not meant to be found.
+    Joints of frozen bodies are ignored.
 
     Args:
         problem: of a fit.
@@ -544,7 +540,7 @@ _MOST_SAMPLES = 50_000  # evenly spaced
 
 
 def unmeasured_at_rest(logs: Sequence[Samples]) -> float | None:
-    """Share of the joint torques of some logs that count as unmeasured, as joints rest; None where none does."""
+    """Fraction of the joint torques that count as unmeasured because joints rest; None without any."""
     flags = [log.resting for log in logs if log.resting is not None and log.resting.numel()]
     return float(sum(resting.sum() for resting in flags)) / sum(resting.numel() for resting in flags) if flags else None
 
@@ -552,17 +548,16 @@ def unmeasured_at_rest(logs: Sequence[Samples]) -> float | None:
 def resting_joints(
     problem: LinearProblem, robot: Robot, builder: RowBuilder, logs: Sequence[Samples]
 ) -> dict[str, float]:
-    """Share of the time that joints are at rest, of those that rest more than motion does, the most first.
+    """Fraction of the time at rest, for joints that rest too often, largest first.
 
-    Of joints whose torque is measured and whose Coulomb friction is fitted with the sign of their velocity: one that
-    sticks has any friction up to that. Where torques of joints at rest count as unmeasured, it is the share of samples
-    in which they do.
+    Considered are joints with measured torque and fitted Coulomb friction with the sign of the velocity: a sticking
+    joint has any friction below Coulomb's. If torques at rest count as unmeasured, it is the fraction of these samples.
 
     Args:
         problem: of the fit.
         robot: with the joints.
-        builder: of the rows of the fit.
-        logs: that were fitted.
+        builder: of the rows.
+        logs: of the fit.
     """
     count = sum(map(len, logs))
     taken = any(log.resting is not None for log in logs)

@@ -40,14 +40,14 @@ _NUMBERS = ("A", "D", "b", "nominal", "scale", "free", "extra_size", "extra_lowe
 
 @dataclass(frozen=True, kw_only=True)
 class FittedPosterior:
-    """The posterior of a fit, with names.
+    """Posterior of a fit, with names.
 
     Attributes:
         posterior: of the parameters, in the order of `body_names` and `torchid.parameters.PARAMETERS`.
         body_names: of the L bodies.
         joint_names: of the joints that move them, "" for the base.
-        extra_names: S labels of the extra parameters that all logs share: "armature of l_knee".
-        extra_units: of these.
+        extra_names: labels of the S extra parameters of all logs, such as "armature of l_knee".
+        extra_units: of the extra parameters.
     """
 
     posterior: Posterior
@@ -60,16 +60,16 @@ class FittedPosterior:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters, "l_knee.m" and so on, and then of the extra ones."""
+        """Names of the parameters, such as "l_knee.m", then of the extra parameters."""
         return (*(f"{body}.{name}" for body in self.body_names for name in PARAMETERS), *self.extra_names)
 
     @cached_property
     def nominal_error(self) -> NominalError | None:
-        """How far off the nominal bodies are where the data speak; None where these determine none."""
+        """Error of the nominal bodies that the data determine; None if the data determine none."""
         return nominal_error(self.posterior)
 
     def prior_error(self, wanted: float | Literal["auto"]) -> float:
-        """A width of the prior as a number; "auto" is the default one unless the data contradict it beyond chance."""
+        """Width of the prior as a number. "auto" is the default width unless the data contradict it significantly."""
         if wanted != "auto":
             return wanted
         error = self.nominal_error
@@ -169,14 +169,14 @@ def write_posterior(path: Path, fitted: FittedPosterior) -> None:
 
 
 def read_posterior(path: Path) -> FittedPosterior:
-    """The posterior of a run, from its folder or from `posterior.npz` of it.
+    """Read the posterior of a run, from its folder or from its `posterior.npz`.
 
     Raises:
         InputError: there is none, or the file is damaged.
     """
     file = path / POSTERIOR if path.is_dir() else path
     if not file.exists():
-        accepted = "a run of this version: torchid identify writes it, overwrite=true replaces a run"
+        accepted = "a run folder of this version; run torchid identify again with overwrite=true"
         raise InputError(path, "RUN", f"no {POSTERIOR} in it" if path.is_dir() else "no such file or folder", accepted)
     try:
         with during("reading", file), open_container(file) as container:
@@ -185,13 +185,13 @@ def read_posterior(path: Path) -> FittedPosterior:
     except LogError as error:
         raise InputError(file, "file", error.found, f"{POSTERIOR} of a run folder") from error
     except (KeyError, ValueError, TypeError) as error:
-        raise InputError(file, "file", f"no posterior ({error})", f"{POSTERIOR} of a run folder") from error
+        raise InputError(file, "file", f"not a posterior ({error})", f"{POSTERIOR} of a run folder") from error
 
 
 def _posterior(arrays: Mapping[str, NDArray[Any]]) -> FittedPosterior:
-    """The posterior; ValueError or KeyError where the arrays are none of one."""
+    """The posterior; ValueError or KeyError if the arrays are not those of one."""
     if arrays["format"].shape != () or int(arrays["format"]) != _FORMAT:
-        raise ValueError("of another version of torchid")
+        raise ValueError("written by another version of torchid")
     texts = {name: tuple(str(x) for x in arrays[name].reshape(-1)) for name in _TEXTS}
     bodies = len(texts["body_names"])
     extras = len(texts["extra_names"])
@@ -227,11 +227,11 @@ def _posterior(arrays: Mapping[str, NDArray[Any]]) -> FittedPosterior:
 
 
 def _numbers(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...]) -> Array:
-    """An array of a shape, -1 for any length; ValueError for another one or numbers out of range."""
+    """An array of the given shape (-1 for any length); ValueError for another shape or numbers out of range."""
     array = np.asarray(arrays[name])
     fits = array.ndim == len(shape) and all(want in (-1, have) for want, have in zip(shape, array.shape, strict=True))
     if not fits or array.dtype != (np.bool_ if name == "free" else np.float64):
-        raise ValueError(f"{name} is no array {shape} of numbers")
+        raise ValueError(f"{name} is not a number array of shape {shape}")
     bounds = name in ("lower", "upper", "extra_lower")
     if np.isnan(array).any() or not (bounds or (np.abs(array) <= _LARGEST).all()):
         raise ValueError(f"{name} has a number that is not finite")
@@ -240,13 +240,15 @@ def _numbers(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ..
 
 @dataclass(frozen=True)
 class ParameterSamples:
-    """N sets of parameters of one robot, each of a robot that can exist.
+    """N physically consistent parameter sets of one robot.
 
     Attributes:
         phi: (N, L, 12), in the order of `torchid.parameters.PARAMETERS`, inertia about the link's origin.
-        extras: (N, S), of the extra parameters that all logs share.
-        body_names: of the L bodies; `joint_names`: of the joints that move them, "" for the base.
-        extra_names: of the extra parameters, "armature of l_knee"; `extra_units`: of these.
+        extras: (N, S), extra parameters of all logs.
+        body_names: of the L bodies.
+        joint_names: of the joints that move them, "" for the base.
+        extra_names: of the extra parameters, such as "armature of l_knee".
+        extra_units: of the extra parameters.
     """
 
     phi: Tensor
@@ -263,18 +265,18 @@ class ParameterSamples:
 
     @property
     def mass(self) -> Tensor:
-        """(N, L) [kg]."""
+        """Masses, (N, L) [kg]."""
         return self.phi[..., parameters.MASS]
 
     @property
     def center_of_mass(self) -> Tensor:
-        """In the link frames, (N, L, 3) [m]; 0 for bodies without mass."""
+        """Centres of mass in the link frames, (N, L, 3) [m]; 0 for bodies without mass."""
         mass = self.mass[..., None]
         return torch.where(mass > 0.0, self.phi[..., parameters.FIRST_MOMENT] / torch.where(mass > 0.0, mass, 1.0), 0.0)
 
     @property
     def inertia(self) -> Tensor:
-        """About the centre of mass, along the axes of the link frame, (N, L, 3, 3) [kg m^2]."""
+        """Inertia about the centre of mass, along the axes of the link frame, (N, L, 3, 3) [kg m^2]."""
         com = self.center_of_mass
         about_origin = com.new_empty(*com.shape, 3)
         numbers = self.phi[..., parameters.INERTIA].unbind(-1)
@@ -285,19 +287,19 @@ class ParameterSamples:
 
     @property
     def coulomb_friction(self) -> Tensor:
-        """Of the joints that move the bodies, (N, L) [N m or N]."""
+        """Coulomb friction of the joints that move the bodies, (N, L) [N m or N]."""
         return self.phi[..., parameters.COULOMB]
 
     @property
     def viscous_friction(self) -> Tensor:
-        """Of the joints that move the bodies, (N, L) [N m s/rad or N s/m]."""
+        """Viscous friction of the joints that move the bodies, (N, L) [N m s/rad or N s/m]."""
         return self.phi[..., parameters.VISCOUS]
 
     def of_joints(self, what: str) -> dict[str, Tensor]:
-        """Actuator terms by joint, each (N,), of one of `ACTUATORS`.
+        """Values of an actuator term by joint, each (N,).
 
         Raises:
-            ValueError: `what` is none of these.
+            ValueError: `what` is not one of `ACTUATORS`.
         """
         if what not in ACTUATORS:
             raise ValueError(f"what: found '{what}'; accepted: {', '.join(ACTUATORS)}")
@@ -312,23 +314,23 @@ class ParameterSamples:
 class PosteriorSampler(torch.nn.Module):
     """Draws parameter sets from the posterior of a run, on the device of the module.
 
-    Inside a training script::
+    In a training script::
 
         sampler = torchid.PosteriorSampler("runs/g1").to("cuda")
         samples = sampler.sample(4096, torch.Generator("cuda").manual_seed(0))
         samples.mass, samples.center_of_mass, samples.inertia, samples.of_joints("armature")
 
-    Each set lies inside all conditions of the run: bodies that can exist, friction of at least 0, bounds. Where the
-    data determine parameters, samples differ as little as standard errors say; where they do not, as much as the prior
-    has it. Sampling itself is not differentiable; it is done in float64.
+    Each set meets all conditions of the run: physically consistent bodies, non-negative friction, bounds. Where the
+    data determine a parameter, its samples vary by the standard error; elsewhere by the width of the prior. Sampling is
+    not differentiable and runs in float64.
 
     Args:
-        run: folder that `torchid identify` wrote, `posterior.npz` of one, or a `FittedPosterior`.
-        prior_error: standard deviation of the nominal parameters, as a share of each body; "auto": 0.2, or as far as
-            they are off where the data speak, if these contradict that.
+        run: run folder of `torchid identify`, its `posterior.npz`, or a `FittedPosterior`.
+        prior_error: standard deviation of the nominal parameters, relative to each body. "auto": 0.2, or the error of
+            the bodies that the data determine, if it contradicts 0.2.
 
     Raises:
-        InputError: the folder is no run, or of an older version.
+        InputError: the folder is not a run, or a run of an older version.
     """
 
     def __init__(self, run: str | Path | FittedPosterior, prior_error: float | Literal["auto"] = PRIOR_ERROR) -> None:
@@ -357,19 +359,19 @@ class PosteriorSampler(torch.nn.Module):
 
     @torch.no_grad()
     def sample(self, count: int, generator: torch.Generator | None = None) -> ParameterSamples:
-        """Parameter sets.
+        """Draw parameter sets.
 
         Args:
-            count: number N of them.
-            generator: of random numbers, on the module's device; None for torch's own.
+            count: number N of sets.
+            generator: of random numbers, on the module's device; None for torch's default.
 
         Raises:
-            ValueError: a count below 1, or a module that was made one of less than float64.
+            ValueError: `count` is below 1, or the module was converted to less than float64.
         """
         if count < 1:
             raise ValueError(f"count: found {count}; accepted: at least 1")
         if self.nominal.dtype != torch.float64:
-            raise ValueError(f"module: found {self.nominal.dtype}; accepted: float64, and samples to another dtype")
+            raise ValueError(f"module: found {self.nominal.dtype}; accepted: float64; convert the samples instead")
         x = self.draws.draw(count, generator)
         phi = self.nominal.repeat(count, 1)
         phi[:, self.free] += x[:, : len(self.to_free)] @ self.to_free.T
@@ -390,10 +392,10 @@ RESIDUAL = "residual.pt"
 
 
 class JointNetworks(nn.Module):
-    """r(q, v, a): a small network for every joint's torque, from that joint's own motion; no force on the base."""
+    """Residual module r(q, v, a): a small network per joint torque, of that joint's motion; no force on the base."""
 
     def __init__(self, n: int, hidden: int = 16) -> None:
-        """Start with zero force, of `n` joints with so many hidden units each."""
+        """Start with zero force, for `n` joints with `hidden` hidden units each."""
         super().__init__()
         self.n = n
         self.weight = nn.Parameter(torch.randn(n, hidden, 3, dtype=torch.float64))
@@ -408,16 +410,16 @@ class JointNetworks(nn.Module):
 
 
 class RigidPlusResidual(nn.Module):
-    """K(q, v, a) phi + r(q, v, a): the generalized forces of rigid bodies and of a learned module.
+    """Generalized forces of rigid bodies and a learned module: K(q, v, a) phi + r(q, v, a).
 
-    `torch.save(model.state_dict(), path)` and `save` keep tensors alone, which `torch.load(path, weights_only=True)`
-    reads; `torch.export` takes it as one graph.
+    `save` and `torch.save(model.state_dict(), path)` store tensors only; `torch.load(path, weights_only=True)` reads
+    them. `torch.export` exports the model as one graph.
     """
 
     phi: Tensor
 
     def __init__(self, robot: Robot, phi: Array, residual: nn.Module) -> None:
-        """Take over parameters (12 L,) and a module r(q, v, a) -> (B, nv) [N, N m]; arguments as of `Regressor`."""
+        """Combine parameters (12 L,) and a module r(q, v, a) -> (B, nv) [N, N m]; arguments as in `Regressor`."""
         super().__init__()
         self.regressor = Regressor(robot)
         self.register_buffer("phi", torch.from_numpy(np.array(phi, dtype=np.float64).ravel()))
@@ -429,27 +431,27 @@ class RigidPlusResidual(nn.Module):
 
     @torch.no_grad()
     def without_residual(self, samples: Samples) -> Samples:
-        """Samples whose joint torques are freed of the module's, for whatever compares them with rigid bodies."""
+        """Subtract the module's joint torques from samples, to compare them with rigid bodies."""
         if samples.torque is None:
             return samples
         force = self.residual(*samples.coordinates())
         return replace(samples, torque=samples.torque - force[:, force.shape[1] - samples.torque.shape[1] :])
 
     def save(self, path: str | Path) -> None:
-        """Write parameters and module."""
+        """Write parameters and module to a file."""
         torch.save({"phi": self.phi, "residual": self.residual.state_dict()}, path)
 
     @classmethod
     def load(cls, path: str | Path, robot: Robot, residual: nn.Module | None = None) -> RigidPlusResidual:
-        """Read what `save` wrote; nothing in the file is run.
+        """Read a file of `save`; no code in the file is executed.
 
         Args:
             path: of the file.
-            robot: whose it is.
-            residual: a module of the same class to take the numbers up; None for `JointNetworks`.
+            robot: the robot of the model.
+            residual: a module of the same class that takes the weights; None for `JointNetworks`.
 
         Raises:
-            InputError: the file is damaged, or of another robot or module.
+            InputError: the file is damaged, or belongs to another robot or module.
         """
         try:
             state = torch.load(path, weights_only=True)
@@ -463,7 +465,6 @@ class RigidPlusResidual(nn.Module):
             raise
         except Exception as error:  # noqa: B902 - an unpickler and torch raise what they like
             reason = f"not readable ({(str(error).splitlines() or [type(error).__name__])[0][:200]})"
-            raise InputError(
-                path, "file", reason, "what RigidPlusResidual.save wrote, of this robot and module"
-            ) from error
+            accepted = "a file that RigidPlusResidual.save wrote for this robot and module"
+            raise InputError(path, "file", reason, accepted) from error
         return cls(robot, phi, residual)

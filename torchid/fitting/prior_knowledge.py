@@ -22,23 +22,23 @@ _POSITIVE = ("m", "Ixx", "Iyy", "Izz")
 
 
 def conditions_from(settings: EstimatorConfig, robot: Robot) -> Conditions:
-    """Conditions on the parameters (L, 12) of a robot's bodies, as an experiment file says.
+    """Conditions on the parameters (L, 12) of a robot's bodies, from an experiment file.
 
-    Least squares may break them; those of a descent with penalties are a margin alone. `com_inside` leaves out bodies
-    that are frozen, have no mass, or whose shapes are not known. Two frozen bodies need not be mirror images.
+    Least squares ignores them; a descent with penalties uses only the margin. `com_inside` skips bodies that are
+    frozen, have no mass, or have no known shape. Two frozen bodies need not be mirror images.
 
     Args:
         settings: of the estimator.
-        robot: for its bodies, shapes and symmetry.
+        robot: with bodies, shapes and symmetry.
 
     Raises:
-        ConfigError: a bound that nothing can meet or that has nothing to bound; shapes nowhere; bodies that are not
-            mirrored (see `mirror_pairs`).
-        UnknownNameError: a body or parameter that there is not.
-        UrdfError: a shape that is not described by numbers.
+        ConfigError: a bound that nothing meets or that bounds nothing, no known shapes, or bodies that are not mirrored
+            (see `mirror_pairs`).
+        UnknownNameError: a body or parameter does not exist.
+        UrdfError: a shape is not described by numbers.
 
     Warns:
-        TorchidWarning: bodies without known shapes, or whose centre of mass in the URDF is outside theirs.
+        TorchidWarning: bodies without known shapes, or with their URDF centre of mass outside them.
     """
     if settings.name == "least_squares" or (settings.name == "sgd" and settings.consistency == "penalties"):
         return Conditions(margin=settings.margin if settings.name == "sgd" else 0.0, names=robot.body_names)
@@ -57,13 +57,13 @@ def conditions_from(settings: EstimatorConfig, robot: Robot) -> Conditions:
 def _enclosures(settings: EstimatorConfig, robot: Robot) -> tuple[Enclosure, ...]:
     if settings.com_inside is None:
         if settings.com_shapes != EstimatorConfig.com_shapes:
-            reason = f"{settings.com_shapes}, without com_inside"
-            raise ConfigError.at_field("estimator.com_shapes", reason, "com_inside: box or ellipsoid as well")
+            reason = f"{settings.com_shapes}, but com_inside is not set"
+            raise ConfigError.at_field("estimator.com_shapes", reason, "com_inside: box or ellipsoid")
         return ()
     bodies = [i for i, body in enumerate(robot.bodies) if not body.massless and body.name not in settings.frozen]
     extents = body_extents(robot, settings.com_shapes, bodies)
     if not extents:
-        reason = f"{settings.com_inside}, but {robot.path.name} says of no body that is fitted what shape it has"
+        reason = f"{settings.com_inside}, but no fitted body in {robot.path.name} has a shape"
         raise ConfigError.at_field("estimator.com_inside", reason, f"null, or a {robot.format} with shapes")
     out = []
     outside = []
@@ -75,9 +75,9 @@ def _enclosures(settings: EstimatorConfig, robot: Robot) -> tuple[Enclosure, ...
         if (local.max() if settings.com_inside == "box" else np.linalg.norm(local)) > 1.0:
             outside.append(robot.body_names[body])
     if outside:
-        where = f"outside the {settings.com_inside} at {', '.join(outside)}"
-        message = f"estimator.com_inside: the {robot.format}'s own centre of mass is {where}"
-        warn_about_file(f"{message}; are the shapes where the matter is? (estimator.com_shapes)")
+        where = f"outside the {settings.com_inside} of {', '.join(outside)}"
+        message = f"estimator.com_inside: the centre of mass of the {robot.format} is {where}"
+        warn_about_file(f"{message}. Check these shapes, or change estimator.com_shapes")
     return tuple(out)
 
 
@@ -120,28 +120,28 @@ def _bounds(settings: EstimatorConfig, robot: Robot) -> tuple[Array | None, Arra
 
 
 def _check_fitted(settings: EstimatorConfig, robot: Robot, body: int, parameter: str, field: str) -> None:
-    """Refuse a bound on what stays as it is in the URDF."""
+    """Raise ConfigError for a bound on a parameter that is not fitted."""
     name = robot.body_names[body]
     friction = parameter in _FRICTION
     if name in settings.frozen:
-        raise ConfigError.at_field(field, "a bound on a body that is frozen", "one of the two")
+        raise ConfigError.at_field(field, "a bound, but the body is frozen", "one of the two")
     if friction and robot.bodies[body].joint is None:
-        raise ConfigError.at_field(field, f"a bound on friction, but {name} is the base", "a body that a joint moves")
+        raise ConfigError.at_field(field, f"a bound on friction, but {name} is the base", "a body with a joint")
     if friction and not settings.friction:
-        raise ConfigError.at_field(field, "a bound on friction, which is not fitted", "friction: true")
+        raise ConfigError.at_field(field, "a bound on friction, but friction is not fitted", "estimator.friction: true")
     if not friction and robot.bodies[body].massless:
-        raise ConfigError.at_field(field, f"a bound, but {name} has no mass in the {robot.format}", "a body that has")
+        raise ConfigError.at_field(field, f"a bound, but {name} has no mass in the {robot.format}", "a body with mass")
 
 
 def _check_interval(parameter: str, low: float | None, high: float | None, field: str) -> None:
-    """Refuse what no number, or no body, is within."""
+    """Raise ConfigError for bounds that no number, or no body, can meet."""
     if low is not None and high is not None and low > high:
-        raise ConfigError.at_field(field, f"{low:g} above {high:g}", "[lower, upper], null for an open side")
+        raise ConfigError.at_field(field, f"lower {low:g} is above upper {high:g}", "[lower, upper]; null for no bound")
     negative = min(x for x in (low, high, 0.0) if x is not None) < 0.0
     if parameter in _FRICTION and negative:
-        raise ConfigError.at_field(field, f"[{low}, {high}]", "bounds of at least 0: friction resists")
+        raise ConfigError.at_field(field, f"[{low}, {high}]", "bounds of at least 0 (friction opposes motion)")
     if parameter in _POSITIVE and high is not None and high <= 0.0:
-        raise ConfigError.at_field(field, f"at most {high:g}", "an upper bound above 0")
+        raise ConfigError.at_field(field, f"upper bound {high:g}", "an upper bound above 0")
 
 
 TOTAL = "estimator.total_mass"
@@ -160,13 +160,13 @@ _LEAST_NOISE = 0.1
 
 @dataclass(frozen=True)
 class KnownMass:
-    """A mass that is known, `weights @ phi = value`.
+    """A known mass, `weights @ phi = value`.
 
     Attributes:
         field: key of the experiment file.
-        weights: (12 L,), 1 at each mass that it is the sum of.
+        weights: (12 L,), 1 at each mass in the sum.
         value: [kg].
-        std: standard deviation [kg], 0 if it is exact.
+        std: standard deviation [kg], 0 if exact.
     """
 
     field: str
@@ -176,11 +176,11 @@ class KnownMass:
 
 
 def known_masses(settings: EstimatorConfig, robot: Robot) -> tuple[KnownMass, ...]:
-    """The masses that an experiment file states.
+    """Known masses of an experiment file.
 
     Raises:
-        UnknownNameError: a body that the robot does not have.
-        ConfigError: a mass of a body that is not fitted, or none left for those that are.
+        UnknownNameError: the robot has no such body.
+        ConfigError: a body with a known mass is not fitted, or known masses leave nothing for the others.
     """
     stated = settings.masses
     for name in stated:
@@ -188,11 +188,11 @@ def known_masses(settings: EstimatorConfig, robot: Robot) -> tuple[KnownMass, ..
         if name not in robot.body_names:
             raise UnknownNameError.at_field("estimator.masses", name, robot.body_names)
         if name in settings.frozen:
-            raise ConfigError.at_field(field, "a mass of a body that is frozen", "one of the two")
+            raise ConfigError.at_field(field, "a mass, but the body is frozen", "one of the two")
         if robot.bodies[robot.body_names.index(name)].massless:
-            raise ConfigError.at_field(field, f"a mass, but {name} has none in the {robot.format}", "a body that has")
+            raise ConfigError.at_field(field, f"a mass, but {name} has none in the {robot.format}", "a body with mass")
         if "m" in (settings.bounds or {}).get(name, {}):
-            raise ConfigError.at_field(field, f"a mass, beside estimator.bounds.{name}.m", "one of the two")
+            raise ConfigError.at_field(field, f"a mass, but estimator.bounds.{name}.m is also set", "one of the two")
     out = [
         KnownMass(f"estimator.masses.{name}", _weight_of(robot, name), mass.value, mass.std)
         for name, mass in stated.items()
@@ -211,7 +211,7 @@ def _weight_of(robot: Robot, body: str) -> Array:
 
 
 def _check_total(settings: EstimatorConfig, robot: Robot) -> None:
-    """Refuse a total that known and frozen bodies leave nothing of, or too much."""
+    """Raise ConfigError if known and frozen masses exceed the total, or no mass is fitted."""
     total = settings.total_mass
     if total is None:
         return
@@ -219,29 +219,29 @@ def _check_total(settings: EstimatorConfig, robot: Robot) -> None:
     held |= {name: mass.value for name, mass in settings.masses.items()}
     free = [body.name for body in robot.bodies if not body.massless and body.name not in held]
     if sum(held.values()) >= total.value:
-        reason = f"{total.value:g} kg, of which {', '.join(held)} alone are {sum(held.values()):.4g} kg"
-        raise ConfigError.at_field(TOTAL, reason, "the mass of the whole robot, as weighed")
+        reason = f"{total.value:g} kg, but {', '.join(held)} alone weigh {sum(held.values()):.4g} kg"
+        raise ConfigError.at_field(TOTAL, reason, "the weighed mass of the whole robot")
     if not free:
-        reason = f"{total.value:g} kg, with the mass of every body frozen or known"
-        raise ConfigError.at_field(TOTAL, reason, "no such key, or a body whose mass is fitted")
+        reason = f"{total.value:g} kg, but the masses of all bodies are frozen or known"
+        raise ConfigError.at_field(TOTAL, reason, "remove this key, or fit the mass of a body")
 
 
 @one_thread()
 def with_known_masses(
     problem: LinearProblem, masses: Sequence[KnownMass], noise: float = 1.0, homogeneous: bool = False
 ) -> LinearProblem:
-    """A problem with known masses as further rows.
+    """Add known masses to a problem as further rows.
 
-    Exact ones are first eliminated from the other rows: these see deviations orthogonal to them (in units of the
-    scale) and what the known masses make of the measured forces. Their own rows then hold to rounding, however far the
-    data are from them and whatever their weight.
+    Exact masses are first eliminated from the other rows: these then depend only on deviations orthogonal to them (in
+    units of the scale). So the rows of exact masses hold to rounding, whatever the data and their weight.
 
     Args:
         problem: in the bodies' parameters.
-        masses: that are known.
-        noise: standard deviation of whitened rows, correlation counted, by which stated deviations are weighted.
-        homogeneous: whether the rows say nothing of how large all forces are. None at all fit them best then, so that a
-            mass with a standard deviation would shrink: one is eliminated too, and its row has the deviation alone.
+        masses: known masses.
+        noise: standard deviation of whitened rows with correlation; it weights masses with a standard deviation.
+        homogeneous: whether the rows do not determine the size of all forces. Zero forces would then fit best and
+            shrink a mass with a standard deviation. So one such mass is eliminated too, and its row has only the
+            deviation.
     """
     noise = max(noise, _LEAST_NOISE)
     kept = [mass for mass in masses if not mass.std]

@@ -57,24 +57,22 @@ _TILT_SETTLED = 1e-6
 _WIDTH_SETTLED = 1e-3
 _LOG_VELOCITY_STEP = 1e-3  # of differences
 _AT_REST_CHANCE = 0.025  # that friction at rest of any joint seems to be beyond Coulomb friction
+_AT_END = "the end of the search range"
 _QUANTILE = 1.96  # standard errors from the middle to the end of a 95 % interval
 
 
 @dataclass(frozen=True)
 class Profile:
-    """A setting that logs have chosen, and what fits with other values of it leave.
+    """A setting chosen by the logs, with the residuals of fits with other values.
 
     Attributes:
-        value: that is used: a number, a flag or two angles; None or 0 for none.
-        text: the value in words, and why it is.
-        tried: values of the setting, the one that means none first.
-        error: of the fits with these over that with none: standard deviation of whitened residuals, or error on
-            left-out blocks where these decide.
-        best: the value of least error, which `value` is not where that may be chance.
-        share: error with the best over that with none.
-        interval: of 95 % around the best; None where the data do not determine it, or blocks decide.
-        inflation: of its standard error by not knowing all other parameters, None likewise.
-        confounded_with: names of other parameters that the best is confounded with, empty if with none.
+        value: the chosen value: a number, a flag or two angles; None or 0 for none.
+        text: the value with its reason, in words.
+        tried: tried values; the first means none.
+        error: residual (or error on left-out blocks) of these fits, divided by that of none.
+        best: the value of least error. `value` differs from it if the gain may be chance.
+        share: error with `best` divided by that with none.
+        interval: 95 % interval around `best`; None if the data do not determine it, or left-out blocks decide.
     """
 
     value: Any
@@ -95,22 +93,22 @@ class Profile:
 
 
 def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) -> Profile:
-    """The delay [s] whose fit of the logs leaves least: torques that act are those recorded so much earlier.
+    """Choose the delay [s] whose fit leaves the least residual; recorded torques act this much later.
 
-    Physical conditions of the estimator hold throughout: a negative armature would explain a delay. Torques are splines
-    between samples, so that the delay can be a part of a step.
+    The estimator's conditions hold throughout, because a negative armature would look like a delay. Torques are splines
+    between samples, so the delay can be a fraction of a step.
 
     Args:
-        logs: bound training logs, read without a delay and low-pass filtered: between samples of those that are not,
-            noise is smaller, which the fit would prefer.
-        fitter: of their rows.
-        terms: extra parameters of these.
+        logs: bound training logs, read without a delay and low-pass filtered. (Without a filter, noise is smaller
+            between samples, which would bias the choice.)
+        fitter: of the rows.
+        terms: extra parameters of the rows.
 
     Raises:
         LogError: the logs are too short.
 
     Warns:
-        TorchidWarning: the best delay is at an end of those that are tried.
+        TorchidWarning: the best delay is at an end of the search range.
     """
     fitter = _with_ridge(fitter)
     plain = replace(fitter, estimator=fitter.least_squares)
@@ -133,30 +131,30 @@ def choose_delay(logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms) 
         interval=(best - reach, best + reach),
         share=share,
         none=0.0,
-        rejected="it does not differ significantly from none" if not abs(best) > reach else "",
+        rejected="not significantly different from 0" if not abs(best) > reach else "",
         in_units=lambda delay: f"{1e3 * delay:.3g} ms",
         tried=(0.0, *_DELAYS.tolist()),
         error=(error[int(np.abs(_DELAYS).argmin())], *error),
     )
     if best in bounds:
         if not profile.confounded_with:
-            warn(f"actuators.delay: {best:g} s or beyond; are torques and positions stamped by the same clock?")
-        return replace(profile, text=f"{profile}; an end of what is tried: the best may lie beyond")
+            warn(f"actuators.delay: {best:g} s, {_AT_END}. Check that torques and positions are stamped by one clock")
+        return replace(profile, text=f"{profile}; {_AT_END}")
     return profile
 
 
 def choose_stribeck(
     logs_and_fitter: Callable[[float | None], tuple[Sequence[Samples], LogFitter]], terms: ExtraTerms
 ) -> Profile:
-    """The Stribeck velocity [rad/s or m/s] whose fit of the logs leaves least, one for all joints.
+    """Choose the Stribeck velocity [rad/s or m/s] with the least residual, one for all joints.
 
-    Friction at rest of each joint is one of the other parameters. None where it is not significant, or the data do not
-    determine the velocity.
+    The static friction of each joint is fitted too. None if it is not significant, or the data do not determine the
+    velocity.
 
     Args:
-        logs_and_fitter: bound training logs, preprocessed with a velocity, and a fitter of their rows; None for no such
-            friction.
-        terms: extra parameters of these.
+        logs_and_fitter: bound training logs, preprocessed with a velocity (None for no Stribeck friction), and a
+            fitter.
+        terms: extra parameters of the rows.
     """
 
     def thin(velocity: float | None) -> tuple[list[Samples], LogFitter]:
@@ -184,7 +182,9 @@ def choose_stribeck(
         interval=(low, high),
         share=fit.estimate.residual_std / max(with_none, 1e-300),
         none=None,
-        needless="" if significance > required else "friction at rest is not significantly beyond Coulomb friction",
+        needless=""
+        if significance > required
+        else "friction at rest is not significantly larger than Coulomb friction",
         rejected="" if low > _VELOCITIES[0] and high < _VELOCITIES[-1] else "the data do not determine it",
         in_units=lambda velocity: f"{velocity:.3g} rad/s (m/s)",
         tried=(None, *_VELOCITIES),
@@ -193,14 +193,14 @@ def choose_stribeck(
 
 
 def choose_base_tilt(logs: Sequence[Samples], fitter: LogFitter) -> Profile:
-    """The tilt about the base's x and y axes [rad] whose fit leaves least, as `torchid.load_robot` takes it.
+    """Choose the tilt about the base's x and y axes [rad] with the least residual (see `torchid.load_robot`).
 
     Args:
-        logs: bound training logs, of a robot without a tilt.
-        fitter: of their rows.
+        logs: bound training logs of a robot without a tilt.
+        fitter: of the rows.
 
     Warns:
-        TorchidWarning: the best tilt is beyond `LARGEST_TILT`.
+        TorchidWarning: the best tilt is at the end of the search range, `LARGEST_TILT`.
     """
     step = max(1, sum(map(len, logs)) // _TILT_SAMPLES)
     logs = [log.every(step) for log in logs]
@@ -222,11 +222,11 @@ def choose_base_tilt(logs: Sequence[Samples], fitter: LogFitter) -> Profile:
     share = math.sqrt(searched.fun)
     is_better = share < 1.0 - _TILT_GAIN
     if is_better and np.abs(searched.x).max() >= LARGEST_TILT:
-        warn(f"robot.base_tilt: {LARGEST_TILT:g} rad or more; is the base's orientation that of another frame?")
+        warn(f"robot.base_tilt: {LARGEST_TILT:g} rad, {_AT_END}. Is the base's orientation that of another frame?")
     x, y = np.rad2deg(searched.x)
-    text = f"none: no tilt of the base explains more (the best leaves {share:.3g} of the residual with none)"
+    text = f"none: no tilt explains the forces better (best: {_ratio(share)})"
     if is_better:
-        text = f"{x:.2f} and {y:.2f} degrees about the base's x and y axes, which leave {share:.3g} of the residual"
+        text = f"{x:.2f} and {y:.2f} degrees about the base's x and y axes; {_ratio(share)}"
     return Profile(
         value=(float(f"{searched.x[0]:.4g}"), float(f"{searched.x[1]:.4g}")) if is_better else (0.0, 0.0),
         text=text,
@@ -235,6 +235,10 @@ def choose_base_tilt(logs: Sequence[Samples], fitter: LogFitter) -> Profile:
         best=tuple(searched.x.tolist()),
         share=share,
     )
+
+
+def _ratio(share: float) -> str:
+    return f"residual {share:.3g} times that without"
 
 
 def _with_ridge(fitter: LogFitter) -> LogFitter:
@@ -251,15 +255,15 @@ def _residual(logs: Sequence[Samples], fitter: LogFitter) -> float:
 def _gauss_newton(
     rows_at: Callable[[float], tuple[list[Samples], LogFitter]], start: float, bounds: tuple[float, float]
 ) -> tuple[float, Fit, ExtraEstimate]:
-    """The value that leaves least, by steps with the setting as one more unknown, and the last fit with its term.
+    """The value of least residual, by steps with the setting as one more unknown, and the last fit with its term.
 
     Source: Kaufman, "A variable projection method for solving separable nonlinear least squares problems", 1975. The
     term's standard error is that of the setting, to first order.
 
     Args:
-        rows_at: at a value, samples whose `slope` is the change of the torques by the setting, and a fitter with it.
+        rows_at: at a value, samples whose `slope` is the change of the torques with the setting, and a fitter.
         start: of the search.
-        bounds: of it.
+        bounds: of the search.
     """
     value = start
     for _ in range(_MAX_STEPS):
@@ -286,22 +290,21 @@ def _profile(
     error: Sequence[float],
     needless: str = "",
 ) -> Profile:
-    """The profile of a best value, by the term of the last fit; `needless`, `rejected`: why it is not used, or ""."""
+    """The profile of a best value; `needless`, `rejected`: reason why it is not used, or ""."""
     confounded = () if term.separable else term.confounded_with or ("other parameters",)
     known = bool(np.isfinite(term.standard_error))
     span = "95 %: {} to {}".format(*map(in_units, interval)) if known else ""
     if confounded:
-        rejected = f"any, such as {in_units(best)}, is confounded with {', '.join(confounded)}"
+        rejected = f"every value, such as {in_units(best)}, is confounded with {', '.join(confounded)}"
     elif not known:
         rejected = "the data do not determine it"
     elif rejected:
         rejected = f"{in_units(best)} ({span}): {rejected}"
-    remainder = f"{share:.3g} of the residual with none"
     value: float | None = float(f"{best:.4g}")
-    text = f"{in_units(best)} ({span}), which leaves {remainder}"
+    text = f"{in_units(best)} ({span}); {_ratio(share)}"
     if needless or rejected:
         value = none
-        text = f"none: {needless or rejected} (the best leaves {remainder})"
+        text = f"none: {needless or rejected} (best: {_ratio(share)})"
     return Profile(
         value=value,
         text=text,
@@ -318,7 +321,7 @@ def _profile(
 def _with_slope_of_velocity(
     thin: Callable[[float | None], tuple[list[Samples], LogFitter]], velocity: float, terms: ExtraTerms
 ) -> tuple[list[Samples], LogFitter]:
-    """Samples at a Stribeck velocity whose `slope` is the change of friction by its logarithm, and a fitter with it."""
+    """Samples at a Stribeck velocity with `slope` the derivative of friction by its logarithm, and a fitter."""
     (before, low), (logs, fitter), (after, high) = (
         thin(velocity * math.exp(x)) for x in (-_LOG_VELOCITY_STEP, 0.0, _LOG_VELOCITY_STEP)
     )
@@ -335,17 +338,14 @@ def _with_slope_of_velocity(
 
 @dataclass(frozen=True)
 class _Torques:
-    """Some samples of a log, whose measured joint torques, of `dofs`, can be taken from any time around.
-
-    `splines`: through them, each for some of the samples.
-    """
+    """Samples of a log with splines through their joint torques (`dofs`), to evaluate them at other times."""
 
     samples: Samples
     dofs: torch.Tensor
     splines: list[tuple[torch.Tensor, BSpline]]
 
     def by(self, delay: float) -> Samples:
-        """The samples with torques of a delay [s], whose slope is what a further delay takes off."""
+        """Samples with torques of a delay [s]; their slope is the change by a further delay."""
         samples = self.samples
         torque = samples.time.new_zeros(len(samples), 0) if samples.torque is None else samples.torque.clone()
         slope = torch.zeros_like(torque)
@@ -357,10 +357,10 @@ class _Torques:
 
 
 def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Torques]:
-    """About so many samples of all logs, evenly spaced, with their torques.
+    """About this many evenly spaced samples of all logs, with splines of their torques.
 
     Raises:
-        LogError: the logs are too short for the delays that are tried.
+        LogError: the logs are shorter than the search range.
     """
     step = max(1, sum(map(len, logs)) // most)
     out = list[_Torques]()
@@ -381,8 +381,8 @@ def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Tor
                 splines.append((torch.from_numpy(at), make_interp_spline(time[segment], recorded[segment], k=degree)))
         out.append(_Torques(samples, dofs, splines))
     if not out:
-        reason = f"auto, but none is longer than the {LATEST_DELAY - EARLIEST_DELAY:g} s of delays that are tried"
-        raise LogError(logs[0].source if logs else "logs", "actuators.delay", reason, "a number [s]")
+        reason = f"auto, but no log is longer than the {LATEST_DELAY - EARLIEST_DELAY:g} s of the search range"
+        raise LogError(logs[0].source if logs else "logs", "actuators.delay", reason, "a number [s], or longer logs")
     return out
 
 
@@ -390,15 +390,16 @@ def _torques(logs: Sequence[Samples], fitter: LogFitter, most: int) -> list[_Tor
 
 
 def choose_sign_width(read: Callable[[float | None], Reading], kinds: Sequence[str]) -> Profile:
-    """The narrowest width [rad/s or m/s] that predicts left-out blocks as well as the one whose fit leaves least.
+    """Choose the narrowest width [rad/s or m/s] that predicts left-out blocks as well as the width of least residual.
 
-    A wider one of the same error would make up for friction elsewhere. None where no width does better than the sign.
+    A wider one with the same error could hide friction errors elsewhere. None if no width predicts better than the
+    sign.
 
     Args:
-        read: the logs with a width, None for the sign.
-        kinds: of the extra parameters that are fitted.
+        read: reads the logs with a width, None for the sign.
+        kinds: of the fitted extra parameters.
     """
-    none = "none: Coulomb friction with tanh(velocity / width) predicts left-out blocks no better"
+    none = "none: tanh(velocity / width) does not predict left-out blocks better than the sign"
     sign = read(None).left_out(kinds)
     gains = [Evidence.of(sign, read(width).left_out(kinds)) for width in _FIRST_WIDTHS]
     if not any(evidence.certain and evidence.gain > _WIDTH_GAIN for evidence in gains):
@@ -421,7 +422,7 @@ def choose_sign_width(read: Callable[[float | None], Reading], kinds: Sequence[s
         best = width = 10.0 ** float(searched.x)
         residual[width] = float(searched.fun)
     share = min(residual.values()) / residual[None]
-    text = none if width is None else f"{width:.4g} rad/s (m/s); the best width leaves {share:.3g} of the residual"
+    text = none if width is None else f"{width:.4g} rad/s (m/s); best {_ratio(share)}"
     return Profile(
         value=None if width is None else float(f"{width:.4g}"),
         text=text,
@@ -433,15 +434,16 @@ def choose_sign_width(read: Callable[[float | None], Reading], kinds: Sequence[s
 
 
 def choose_radius(read: Callable[[float | None], Reading], kinds: Sequence[str]) -> Profile:
-    """The radius [m] of balls about the frames of feet that predicts left-out blocks best, to second order in it.
+    """Choose the radius [m] of balls about the foot frames that predicts left-out blocks best.
 
-    None where what the robot's file has predicts as well, or the logs do not say where the ground is.
+    The optimum is that of a parabola. None if the shapes of the robot's file predict as well, or if the logs do not
+    contain the direction of the ground.
 
     Args:
-        read: the logs with a radius, None for what the file has.
-        kinds: of the extra parameters that are fitted.
+        read: reads the logs with a radius, None for the shapes of the file.
+        kinds: of the fitted extra parameters.
     """
-    text = "of the robot's file: balls about the frames of the feet predict left-out blocks no better"
+    text = "of the robot's file: balls about the foot frames do not predict left-out blocks better"
     in_file = read(None).left_out(kinds)
     try:
         gains = [Evidence.of(in_file, read(radius).left_out(kinds)).gain for radius in _RADII]
@@ -453,7 +455,7 @@ def choose_radius(read: Callable[[float | None], Reading], kinds: Sequence[str])
     if _RADII[0] < best < _RADII[-1]:
         evidence = Evidence.of(in_file, read(best).left_out(kinds))
     if evidence.adopted:
-        text = f"balls of {1e3 * best:.3g} mm about the frames (error on left-out blocks {evidence})"
+        text = f"balls of {1e3 * best:.3g} mm about the foot frames (error on left-out blocks {evidence})"
     return Profile(
         value=best if evidence.adopted else None,
         text=text,
@@ -468,14 +470,14 @@ _LEAST_LEFT = 0.3  # of the rows, that a setting may leave
 
 
 def choose_data(read: Mapping[Any, Callable[[], Reading]], kinds: Sequence[str]) -> Profile:
-    """Of settings that leave ever more data out, the first whose fit predicts what the others keep as well as theirs.
+    """Choose the first of several settings, which leave out more and more data, that predicts as well as the others.
 
     Args:
-        read: the logs with each value of a setting.
-        kinds: of the extra parameters that are fitted.
+        read: reads the logs, by value of the setting.
+        kinds: of the fitted extra parameters.
 
     Raises:
-        InputError: the first leaves nothing.
+        InputError: the first setting leaves no data.
     """
     readings: list[Reading] = []
     for number, read_one in enumerate(read.values()):
@@ -492,7 +494,7 @@ def choose_data(read: Mapping[Any, Callable[[], Reading]], kinds: Sequence[str])
     value = tried[widest(readings, kinds)]
     reason = "a fit to all samples predicts left-out blocks worse"
     if value == tried[0]:
-        reason = "a fit without these samples predicts left-out blocks no better"
+        reason = "a fit without these samples does not predict left-out blocks better"
     if value is None or isinstance(value, bool):
         name = {None: "none", False: "counted", True: "left out"}[value]
     else:

@@ -48,12 +48,12 @@ _FARTHEST = 1.9  # steps of weighted least squares, a majorizer of the loss: any
 
 @dataclass(frozen=True)
 class RobustLoss:
-    """A loss rho(u) of residuals u in units of their scale, and how many passes over the logs it may take.
+    """Robust loss rho(u) of scaled residuals u, and the largest number of passes over the logs.
 
     Attributes:
         kind: "huber", or "tukey" for Tukey's biweight.
-        tuning: constant of the loss; `TUNING` has the usual ones.
-        passes: over the logs, at most.
+        tuning: constant of the loss; `TUNING` has the usual values.
+        passes: largest number of passes over the logs.
     """
 
     kind: str
@@ -62,23 +62,23 @@ class RobustLoss:
 
     @classmethod
     def named(cls, kind: str, tuning: float | None = None, passes: int = 50) -> RobustLoss:
-        """A loss by its name, with its usual tuning if none is given.
+        """Make a loss by its name, with its usual tuning by default.
 
         Raises:
-            UnknownNameError: a name not in `TUNING`.
+            UnknownNameError: the name is not in `TUNING`.
         """
         if kind not in TUNING:
             raise UnknownNameError("arguments", "loss", kind, TUNING)
         return cls(kind, TUNING[kind] if tuning is None else tuning, passes)
 
     def weight(self, u: Tensor) -> Tensor:
-        """rho'(u) / u."""
+        """Weight rho'(u) / u."""
         if self.kind == "huber":
             return torch.where(u.abs() <= self.tuning, 1.0, self.tuning / u.abs())
         return (1.0 - (u / self.tuning).square()).clamp_min(0.0).square()
 
     def slope(self, u: Tensor) -> Tensor:
-        """rho''(u)."""
+        """Second derivative rho''(u)."""
         if self.kind == "huber":
             return (u.abs() <= self.tuning).to(u)
         x = (u / self.tuning).square()
@@ -116,22 +116,22 @@ def fit_robustly(
     solve: Solve | None = None,
     progress: ProgressCallback | None = None,
 ) -> RobustFit:
-    """Iteratively re-weighted least squares, a pass over the logs each time, memory flat in their length.
+    """Fit by iteratively re-weighted least squares; one pass over the logs each, memory independent of their length.
 
-    A pass weighs the rows by their residuals at one point and fits them. It is the last if it finds what it started
-    from; otherwise the next starts where Newton's method would go, were outliers spread evenly. Long logs begin with
-    passes over every k-th sample. Standard errors are those of the loss, not of the last weighted least squares::
+    A pass weights the rows by their residuals at one point and fits them. If the result equals the start, it is the
+    last pass. Otherwise the next pass starts at the point of Newton's method, assuming evenly distributed outliers.
+    Long logs begin with passes over every k-th sample. Standard errors are those of the robust loss::
 
         robust = torchid.fit_robustly(logs, fitter, torchid.RobustLoss.named("huber"))
         robust.fit.estimate.phi, robust.summary.mean_weight
 
     Args:
         logs: bound logs.
-        fitter: of their rows.
-        loss: what residuals cost.
-        first: the fit of all rows alike, if there is one already.
-        parts: the logs as `compress_in_blocks` compresses them, if they have been.
-        solve: instead of the fitter's estimator.
+        fitter: of the rows.
+        loss: of the residuals.
+        first: a fit with equal weights, if available.
+        parts: the logs compressed by `compress_in_blocks`, if available.
+        solve: replaces the fitter's estimator.
         progress: called with the number of samples done.
 
     Source:

@@ -59,11 +59,11 @@ class BaseParameters(nn.Module):
     """Base parameters phi_B = G phi with `K phi = K_B phi_B` (eq. 11) for all rows K like those of their problem.
 
     Attributes:
-        kept: (P_B,) int, ascending; base parameter i is parameter `kept[i]` and what was regrouped into it.
-        combination: G, (P_B, P): the identity in the kept columns, zero in those that are not free.
+        kept: (P_B,) int, ascending; base parameter i is parameter `kept[i]` plus the parameters regrouped into it.
+        combination: G, (P_B, P): the identity in the kept columns, zero in columns that are not free.
         null_space: (P_free - P_B, P), directions h with K h = 0; `null_space / scale` is orthonormal.
-        free: (P,) bool; the others are constants, see `forward`.
-        scale: (P,), the problem's.
+        free: (P,) bool; the other parameters are constants, see `forward`.
+        scale: (P,), of the problem.
         rank, gap, singular_values: of the columns scaled to norm 1, see `rank_and_gap`.
     """
 
@@ -78,7 +78,7 @@ class BaseParameters(nn.Module):
         singular_values: Array,
         rank_gap: RankGap,
     ) -> None:
-        """Created by `base_parameters`."""
+        """Use `base_parameters` to create one."""
         super().__init__()
         self.kept = kept
         self.combination = combination
@@ -91,12 +91,12 @@ class BaseParameters(nn.Module):
 
     def extra_repr(self) -> str:
         """What `repr` says."""
-        return f"{self.rank} combinations of {int(self.free.sum())} free parameters of {len(self.free)}"
+        return f"{self.rank} base parameters from {len(self.free)} parameters ({int(self.free.sum())} free)"
 
     def forward(self, K: Tensor) -> Tensor:
         """K_B, (..., P_B), of a regressor K, (..., P).
 
-        Parameters that are not free have no part in phi_B: `K phi = K_B phi_B + K[..., ~free] @ phi[~free]`.
+        Parameters that are not free are not in phi_B: `K phi = K_B phi_B + K[..., ~free] @ phi[~free]`.
         """
         return K.index_select(-1, self.index)
 
@@ -105,20 +105,20 @@ class BaseParameters(nn.Module):
         return phi @ self.combination.T
 
     def lift(self, phi_B: Array, nominal: Array) -> Array:
-        """The parameters (..., P) nearest to `nominal`, (P,), in units of `scale`, with base parameters (..., P_B)."""
+        """Parameters (..., P) nearest to `nominal`, (P,), in units of `scale`, with base parameters (..., P_B)."""
         step = np.zeros((*phi_B.shape[:-1], len(self.scale)))
         step[..., self.kept] = (phi_B - self.reduce(nominal)) / self.scale[self.kept]
         directions = self.null_space / self.scale
         return nominal + self.scale * (step - step @ directions.T @ directions)
 
     def reduce_problem(self, problem: LinearProblem) -> LinearProblem:
-        """The same problem in the base parameters, all free and observable; constants move to its right-hand side.
+        """The same problem in the base parameters, all free and observable. Constants move to the right-hand side.
 
         Raises:
-            ValueError: other parameters are free there.
+            ValueError: the problem has other free parameters.
         """
         if not np.array_equal(problem.free, self.free):
-            raise ValueError("free: found others than in the problem of these base parameters; accepted: the same")
+            raise ValueError("free: found other free parameters than in these base parameters; accepted: the same")
         constant = np.where(self.free, 0.0, problem.nominal)
         return replace(
             problem,
@@ -134,20 +134,22 @@ class BaseParameters(nn.Module):
 def base_parameters(
     problem: LinearProblem, tolerance: float = RANK_TOLERANCE, preference: Array | None = None
 ) -> BaseParameters:
-    """The combinations of parameters that the rows of a problem depend on, and those that they do not.
+    """Find the parameter combinations that the rows of a problem depend on (base parameters), and their null space.
 
-    Columns are scaled to norm 1, so that a finger's inertia counts as much as the torso's mass. A pivoted QR
-    factorization of their null space decides which parameters are regrouped into the others. Source: Gautier,
-    "Numerical calculation of the base inertial parameters of robots", 1991.
+    Columns are scaled to norm 1, so a finger's inertia counts as much as the torso's mass. A pivoted QR factorization
+    of the null space decides which parameters are regrouped into others.
+
+    Source: Gautier, "Numerical calculation of the base inertial parameters of robots", 1991.
 
     Args:
         problem: with the rows.
-        tolerance: a parameter whose column is below this share of the largest, in units of `problem.scale`, is not
-            observable; a singular value of the scaled columns below this share of the largest counts as zero.
-        preference: (P,), > 0, for regrouping each parameter into others; by default `_regrouping_preference`.
+        tolerance: a parameter is unobservable if its column (in units of `problem.scale`) is below this fraction of the
+            largest; a singular value of the scaled columns below this fraction of the largest counts as zero.
+        preference: (P,), > 0, preference for regrouping each parameter into others; by default
+            `_regrouping_preference`.
 
     Warns:
-        NumericalWarning: the rank is a matter of the tolerance.
+        NumericalWarning: the rank depends on the tolerance.
     """
     free = np.flatnonzero(problem.free)
     count = len(problem.scale)
@@ -214,23 +216,23 @@ def structural_rank(problem: LinearProblem) -> RankGap:
     """Rank of a problem's free columns, scaled to norm 1.
 
     Warns:
-        NumericalWarning: the rank is a matter of the tolerance.
+        NumericalWarning: the rank depends on the tolerance.
     """
     columns, _ = _normalized_columns(problem, RANK_TOLERANCE)
     return rank_and_gap(scipy.linalg.svd(columns, compute_uv=False, lapack_driver="gesvd"))
 
 
 def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
-    """Rank of a matrix with columns of one size.
+    """Rank of a matrix with columns of similar size, and the gap to the next singular value.
 
-    Values below rounding count as `eps` times the largest one in the gap, which is 4.5e15 at most.
+    Values below rounding count as `eps` times the largest value, so the gap is at most 4.5e15.
 
     Args:
         values: singular values (P,), descending.
-        tolerance: a value below this share of the largest counts as zero.
+        tolerance: values below this fraction of the largest count as zero.
 
     Warns:
-        NumericalWarning: a gap below 1e3: another tolerance gives another rank.
+        NumericalWarning: the gap is below 1e3, so another tolerance gives another rank.
     """
     rank = numerical_rank(values, tolerance)
     if rank == 0:
@@ -238,8 +240,8 @@ def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
     dropped = max(float(values[rank]) if rank < len(values) else 0.0, np.finfo(float).eps * float(values[0]))
     gap = float(values[rank - 1]) / dropped
     if gap < _CLEAR_GAP:
-        message = f"rank {rank}: the next singular value is only {gap:.3g} times smaller than the last that counts"
-        warn(f"{message}; the rank is a matter of the tolerance, {tolerance:g}", NumericalWarning)
+        message = f"rank {rank} is not clear: the next singular value is only {gap:.3g} times smaller"
+        warn(f"{message}. Another tolerance than {tolerance:g} gives another rank", NumericalWarning)
     return RankGap(rank, gap)
 
 
@@ -338,18 +340,18 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
 
 
 def require_base(reports: Sequence[StateReport], on_base_lost: str = "error", contacts: Sequence[Contact] = ()) -> None:
-    """Refuse logs, or warn, with a contact state in which part of the base does not survive the projection.
+    """Raise BaseLostError, or warn, if the projection loses a part of the base in a contact state.
 
     Args:
         reports: from `state_reports`.
         on_base_lost: "error" or "warn".
-        contacts: all contacts: the axes of those that are lines are named.
+        contacts: all contacts; the message names the axes of line contacts.
 
     Raises:
-        BaseLostError: a floating base of which only part survives the projection.
+        BaseLostError: a floating base loses rank in the projection.
 
     Warns:
-        BaseLostWarning: instead of the error, with "warn".
+        BaseLostWarning: the same, with "warn".
     """
     lost = [report for report in reports if report.base_rank is not None and report.base_rank < 6]
     if not lost:
@@ -359,10 +361,10 @@ def require_base(reports: Sequence[StateReport], on_base_lost: str = "error", co
     touching = {frame for report in lost for frame in report.name.split(" + ")}
     lines = [f"{c.line_axis} of {c.frame}" for c in contacts if c.kind == "line" and c.frame in touching]
     if lines:
-        message += f"; lines count as along {join_names(lines)}: set line_axis of those along another"
+        message += f"; lines run along {join_names(lines)}, or set line_axis"
     if on_base_lost == "error":
         raise BaseLostError(f"{message}; accepted: more sensors, other contacts, or sensors.on_base_lost: warn")
-    warn(f"{message}; parameters of some bodies cannot be determined there", BaseLostWarning)
+    warn(f"{message}. These samples do not determine the parameters of some bodies", BaseLostWarning)
 
 
 def _base_statistics(values: Tensor, weight: Tensor) -> tuple[int, float, float, dict[int, float]]:
@@ -373,7 +375,7 @@ def _base_statistics(values: Tensor, weight: Tensor) -> tuple[int, float, float,
 
 
 def merge_state_reports(of_logs: Iterable[Sequence[StateReport]]) -> list[StateReport]:
-    """Reports of several logs together, most frequent first; singular values are medians of those of the logs."""
+    """Merge reports of several logs, most frequent first; singular values are medians over the logs."""
     by_name: dict[str, list[StateReport]] = {}
     for report in chain.from_iterable(of_logs):
         by_name.setdefault(report.name, []).append(report)
@@ -381,7 +383,7 @@ def merge_state_reports(of_logs: Iterable[Sequence[StateReport]]) -> list[StateR
 
 
 def _merged(same: Sequence[StateReport]) -> StateReport:
-    """The report of one contact state from those of several logs."""
+    """Merge the reports of one contact state from several logs."""
     samples = sum(report.samples for report in same)
     shares = defaultdict[int, float](float)
     for report in same:
@@ -411,7 +413,7 @@ def _common_rank(shares: Mapping[int, float]) -> int:
 
 def _describe_rank(report: StateReport) -> str:
     """Rank of most samples, and the share of samples with rank 6."""
-    share = f", 6 in {format_percent(report.base_full_share)} % of them" if report.base_full_share else ""
+    share = f", rank 6 in {format_percent(report.base_full_share)} % of them" if report.base_full_share else ""
     return f"rank {report.base_rank} of 6{share}"
 
 
@@ -439,17 +441,17 @@ def structural_problem(
     friction: bool = True,
     samples: Sequence[Samples] | None = None,
 ) -> LinearProblem:
-    """The linear problem of random motions in some contact states; its right-hand side is 0.
+    """Linear problem of random motions in given contact states, with right-hand side 0.
 
-    Its rank is an upper bound of that of any log.
+    Its rank is an upper bound for the rank of any log.
 
     Args:
         robot: the robot.
         contacts: the contacts in use.
         sensors: which forces are measured.
-        states: contact states the robot may be in.
+        states: contact states of the robot.
         friction: whether friction is free.
-        samples: of these states, if they have been drawn already.
+        samples: random samples of these states, if already drawn.
     """
     builder = RowBuilder(robot, contacts, sensors)
     drawn = structural_samples(robot, contacts, states) if samples is None else samples
@@ -479,16 +481,16 @@ def standing_samples(
 ) -> Samples:
     """Random samples that satisfy the constraints of a contact state; forces are zeros.
 
-    The ground differs between samples: points and lines stand on any slope, flat feet of a floating base stand along
-    their contacts' normals, so that gravity never turns in their frames on a level floor. The rank is an upper bound of
-    that on one ground. A fixed base stands as the robot's.
+    The ground differs between samples, so the rank is an upper bound for one ground. Points and lines stand on any
+    slope. Flat feet of a floating base stand along their contacts' normals, so gravity has a constant direction in
+    their frames. A fixed base has the pose of the robot.
 
     Args:
         robot: the robot.
         contacts: the contacts in use.
         state: which of them touch the ground.
         count: number N of samples.
-        rng: draws them.
+        rng: random number generator.
     """
     q, v, a = standing_states(robot, contacts, state, count, rng)
     rows = robot.base_rows
@@ -512,16 +514,16 @@ def standing_samples(
 def standing_states(
     robot: Robot, contacts: Sequence[Contact], state: ContactState, count: int, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Coordinates q (B, n + 7), v, a (B, nv), as `Regressor` takes them: `J_C v = 0`, `J_C a + dJ_C/dt v = 0`.
+    """Coordinates q (B, n + 7), v, a (B, nv), as `Regressor` takes them, with `J_C v = 0`, `J_C a + dJ_C/dt v = 0`.
 
-    J_C has the rows of the components that active contacts can exert: a point contact fixes its frame's origin, a flat
-    one the whole frame, a line contact all but the rotation about itself; with a radius, they roll. Twice as many
-    states are drawn, and those nearest to a singular J_C are dropped: accelerations are unbounded there. Loops are
-    closed, and have rows too. Of flat feet the frames' axes that are nearest to upward at joint positions of 0 are
-    along the normals, but for robots with loops.
+    J_C has the components that active contacts can transmit: a point fixes its frame's origin, a flat contact the whole
+    frame, a line all but the rotation about itself; with a radius, they roll. Closed loops have rows too. Twice as many
+    states are drawn, and those nearest to a singular J_C are dropped, because accelerations are unbounded there. The
+    axis of a flat foot that is nearest to upward at joint positions of 0 is along the normal (not for robots with
+    loops).
 
     Raises:
-        UrdfError: loops that close nowhere.
+        UrdfError: the loops do not close.
     """
     q, v, a = _random_states(robot, 2 * count, rng)
     constrained = [contact for contact, active in zip(contacts, state, strict=True) if active]
@@ -600,8 +602,8 @@ def closed_postures(robot: Robot, postures: Array) -> Array:
     positions, closed = closures.closed(torch.cat([zero, _ASSEMBLY * torch.from_numpy(postures)]))
     if not closed.any():
         size = float(closures.deviations(zero).abs().max())
-        text = f"loops that are open by {size:.3g} m or rad at joint positions of 0, and close nowhere near"
-        raise UrdfError(robot.path, LOOPS_FIELD, text, "frames that the joints can bring together")
+        text = f"loops are open by {size:.3g} m or rad at joint positions of 0 and do not close near there"
+        raise UrdfError(robot.path, LOOPS_FIELD, text, "loop frames that coincide at some joint positions near 0")
     positions = positions[closed]
     positions = positions[positions.abs().amax(1).argsort()]
     values = torch.linalg.svdvals(closures.jacobian(positions))

@@ -76,12 +76,12 @@ class ExtraEstimate:
 def estimate_extras(
     assembly: Assembly, estimate: Estimate, body_names: Sequence[str], rank_tolerance: float = RANK_TOLERANCE
 ) -> list[ExtraEstimate]:
-    """All eliminated extra parameters that some row depends on, at the estimated parameters of the bodies.
+    """Estimate all eliminated extra parameters that some row depends on, at the bodies' estimated parameters.
 
     Args:
         assembly: from `assemble`.
         estimate: of its problem.
-        body_names: the robot's.
+        body_names: of the robot.
         rank_tolerance: as in `LeastSquares`.
     """
     if not assembly.eliminations:
@@ -106,13 +106,13 @@ def estimate_extras(
 
 @dataclass(frozen=True)
 class TotalMass:
-    """The total mass of a fit [kg].
+    """Total mass of a fit [kg].
 
     Attributes:
-        standard_error: infinite where the data do not determine it.
-        separable: whether it is not confounded with offsets and scales of sensors, as in `ExtraEstimate`.
-        value: the identified one.
-        nominal: the URDF's.
+        standard_error: infinite if the data do not determine the mass.
+        separable: whether it is not confounded with sensor offsets and scales, as in `ExtraEstimate`.
+        value: identified.
+        nominal: of the URDF.
     """
 
     standard_error: float
@@ -122,7 +122,7 @@ class TotalMass:
 
     @property
     def determined(self) -> bool:
-        """Whether the data determine it: a 95 % interval no wider than the URDF's mass on either side."""
+        """Whether the data determine it: the 95 % interval is no wider than the URDF's mass on either side."""
         return self.separable and 2.0 * self.standard_error <= self.nominal
 
     def __str__(self) -> str:
@@ -130,7 +130,7 @@ class TotalMass:
         if self.determined:
             return f"{decimal(self.value)} ± {self.standard_error:.2g} kg"
         if not self.separable:
-            return "not determined: confounded with offsets"
+            return "not determined: confounded with sensor offsets"
         known = f", standard error {self.standard_error:.2g} kg" if np.isfinite(self.standard_error) else ""
         return f"not determined by the data{known}"
 
@@ -167,7 +167,7 @@ def total_mass(
 
 
 def mass_weights(bodies: int) -> Array:
-    """Weights of the total mass in all parameters of so many bodies, (12 L,)."""
+    """Weights of the total mass in the parameters of all bodies, (12 L,)."""
     weights = np.zeros((bodies, parameters.PER_BODY))
     weights[:, parameters.MASS] = 1.0
     return weights.flatten()
@@ -194,15 +194,15 @@ def combination_standard_error(
 
 @dataclass(frozen=True)
 class ParameterCovariance:
-    """Covariance of the free parameters by the rows alone, in units of their scale and of the rows' noise.
+    """Covariance of the free parameters from the rows alone, in units of their scale and of the rows' noise.
 
     Attributes:
-        root: (P', rank), its outer product is the covariance.
+        root: (P', rank); its outer product is the covariance.
         null_space: (P', P' - rank), directions that no row depends on.
-        values: (P',), singular values that belong to the columns of both.
+        values: (P',), singular values of the columns of both.
         scale: (P',), of the free parameters.
         free: (P,) bool.
-        by_stated: (P', stated), change of the parameters by unit errors of what is known of them.
+        by_stated: (P', stated), change of the parameters per unit error of stated values, such as known masses.
     """
 
     root: Array
@@ -214,7 +214,7 @@ class ParameterCovariance:
 
     @classmethod
     def of(cls, problem: LinearProblem, rank_tolerance: float, stated: int = 0) -> ParameterCovariance:
-        """Of the rows of a problem, the last `stated` of which are no data; `rank_tolerance` as in `LeastSquares`."""
+        """From the rows of a problem; the last `stated` rows are not data. `rank_tolerance` as in `LeastSquares`."""
         return problem.shared(("covariance", rank_tolerance, stated), lambda: cls._of(problem, rank_tolerance, stated))
 
     @classmethod
@@ -356,25 +356,25 @@ _NORMAL = float(ndtri(0.975))
 
 @dataclass(frozen=True)
 class Jackknife:
-    """What parameters scatter by from block to block of the logs, as standard errors.
+    """Standard errors from the scatter of the parameters between blocks of the logs.
 
-    Blocks of successive samples are longer than whatever correlates the residuals of neighbouring ones: noise that a
-    filter has smeared, but also what the model lacks, such as friction. Left out one by one, they say how much of such
-    residuals ends up in the estimate; standard errors by the size of the residuals count them as noise instead.
+    Blocks of successive samples are longer than the correlation time of residuals: filtered noise, but also model
+    errors such as friction. Leaving out one block at a time shows how much of such residuals enters the estimate.
+    Standard errors from the size of the residuals treat them as white noise.
 
     Source: delete-a-group jackknife (Shao, Wu, Annals of Statistics 17, 1989), which for least squares is the
     cluster-robust covariance CR3 (Bell, McCaffrey, Survey Methodology 28, 2002), with quantiles of Student's t.
 
     Attributes:
-        blocks: their number G.
-        deviations: (G, 12 L), whose norm over the blocks is the standard error of the parameters; 1.96 times it is half
-            of a 95 % interval. Where rows are mostly noise of the motion, rows of what they lack follow (`shrinkage` of
-            `LinearProblem`): no scatter shows that.
-        without_ridge: (G, 12 L), the same of the estimate without regularization.
-        extras: the same of the extra parameters, (G, M) for each elimination, without regularization.
-        lack_of_fit: variance of the blocks' part of the residuals over what it is if residuals are independent noise: 1
-            if the model explains the forces, more if residuals are alike within a block. Of combinations of parameters
-            on which little of the information is noise of the motion. None where blocks are too few to tell.
+        blocks: number G of blocks.
+        deviations: (G, 12 L); their norm over the blocks is the standard error of the parameters, and 1.96 times it
+            half of a 95 % interval. Rows from `shrinkage` of `LinearProblem` follow, if the rows are mostly motion
+            noise; the scatter does not show this error.
+        without_ridge: (G, 12 L), the same for the estimate without regularization.
+        extras: the same for the extra parameters, (G, M) for each elimination, without regularization.
+        lack_of_fit: variance of the residuals between blocks, divided by its value for white residuals: 1 if the model
+            explains the forces, larger if residuals are correlated within a block. Only combinations with little motion
+            noise count. None with too few blocks.
     """
 
     blocks: int
@@ -479,11 +479,11 @@ def _by_block(
     phi: Array,
     basis: Array,
 ) -> tuple[dict[str, Array], Array, Array]:
-    """Gradients of half the squared residuals of each block, (G, columns), its share of information, and noise in it.
+    """Gradients of half the squared residuals of each block, (G, columns), its share of information, and its noise.
 
-    Gradients, without what noise of the motion adds, are by "bodies", all parameters with the extra ones at their best,
-    and by the log of each elimination, its extra parameters with those of single logs at their best. Shares and noise
-    are (G, r, r), by the columns of the basis.
+    Gradients exclude the contribution of motion noise. They are by "bodies" (all parameters, with the best extra
+    parameters), and by the log of each elimination (its extra parameters, with the best ones of single logs). Shares
+    and noise are (G, r, r), by the columns of the basis.
     """
     count = max(numbers.values()) + 1
     gradients = {name: np.zeros((count, width)) for name, width in _widths(assembly).items()}
@@ -523,10 +523,10 @@ def _widths(assembly: Assembly) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class _Columns:
-    """Parameters in the columns of a log's rows, (width,), and how they depend on those that a fit has.
+    """Parameters in the columns of a log's rows, (width,), and their derivatives by the parameters of a fit.
 
-    `by_phi`, (width, 12 L), with the extra parameters at their best; `by_extras`: (width, M) by the log of an
-    elimination, "" for that of all logs, with the unknowns of single logs at their best.
+    `by_phi`, (width, 12 L), with the best extra parameters; `by_extras`: (width, M) by the log of an elimination (""
+    for all logs), with the best unknowns of single logs.
     """
 
     source: str
@@ -535,7 +535,7 @@ class _Columns:
     by_extras: dict[str, Array]
 
     def add_gradient(self, gradients: Mapping[str, Array], number: int, at: Sequence[int], gradient: Array) -> None:
-        """Add the gradient by some columns to that of a block."""
+        """Add the gradient by some columns to the gradient of a block."""
         gradients["bodies"][number] += self.by_phi[at].T @ gradient
         for log, by_extras in self.by_extras.items():
             gradients[_name(log)][number] += by_extras[at].T @ gradient

@@ -30,12 +30,11 @@ _CHUNK = 256  # samples whose rows are computed together
 
 @dataclass(frozen=True)
 class InformationGain:
-    """Information gained over the prior "each free parameter is within one scale of its nominal value".
+    """Information gained over the prior that each free parameter is within one scale of its nominal value.
 
-    With H the information of the whitened rows in units of the scales, `bits` = log2 det(I + H) / 2, by how many
-    halvings the standard deviations shrink in all, and `determined` = tr((I + H)^-1 H), the number of independent
-    combinations that the data determine better than the prior, counted by their share. Source: both are those of
-    Bayesian linear regression; MacKay, "Bayesian interpolation", 1992.
+    With H the information of the whitened rows in units of the scales: `bits` = log2 det(I + H) / 2, the total number
+    of halvings of the standard deviations; `determined` = tr((I + H)^-1 H), the number of combinations that the data
+    determine better than the prior. Source: Bayesian linear regression; MacKay, "Bayesian interpolation", 1992.
     """
 
     bits: float
@@ -43,7 +42,7 @@ class InformationGain:
 
     @classmethod
     def of(cls, information: Array) -> InformationGain:
-        """From the eigenvalues of H, (M,), at least 0 but for rounding."""
+        """From the eigenvalues of H, (M,), at least 0 except for rounding."""
         values = np.maximum(information, 0.0)
         return cls(float(np.log1p(values).sum() / np.log(4.0)), float((values / (1.0 + values)).sum()))
 
@@ -154,22 +153,22 @@ def add_information(parts: Sequence[SensorInformation]) -> SensorInformation:
 
 
 def prior_directions(builder: RowBuilder, prior: Array) -> Array:
-    """N, (columns, M), so that rows X in the builder's columns have the information `N^T X^T X N`.
+    """N, (columns, M): rows X in the builder's columns have the information `N^T X^T X N`.
 
-    `N N^T` is the covariance of the columns' parameters if parameters are independent with the standard deviations
-    `prior`, (12 L,), 0 where they are known, and extras with that of their size.
+    `N N^T` is the prior covariance of the columns' parameters, for independent parameters with standard deviations
+    `prior`, (12 L,), 0 where known, and extras with their size.
     """
     rigid = triangular_factor((builder.columns.parameter_map * prior).T).T
     return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
 
 
 def _marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Array:
-    """Information about the other columns where some are unknown: the Schur complement, as `eliminate_columns` on rows.
+    """Information about some columns with others unknown: the Schur complement, as `eliminate_columns` on rows.
 
     Args:
         H: (N, N), X^T X.
         unknown: indices of M columns.
-        size: (M,), squared norms of these; what is below the share `KINEMATIC_TOLERANCE` of them is rounding.
+        size: (M,), squared norms of these; values below the fraction `KINEMATIC_TOLERANCE` are rounding.
     """
     if not unknown:
         return H
@@ -278,15 +277,15 @@ def contributions(
     rank_tolerance: float = RANK_TOLERANCE,
     done: ProgressCallback | None = None,
 ) -> Contributions:
-    """Leave every log, contact state and sensor out in turn.
+    """Information that each log, contact state and sensor contributes, by leaving it out.
 
-    Contributions are to the bodies' parameters: offsets, scales and actuator terms are nuisance parameters. Logs and
-    contact states are exact, sensors as in `sensor_information`.
+    Contributions are to the bodies' parameters; offsets, scales and actuator terms are nuisance parameters. They are
+    exact for logs and contact states, and approximate for sensors (see `sensor_information`).
 
     Args:
         parts: of the logs.
-        logs: bound logs; none: sensors are not left out, which takes samples.
-        builder: of their rows.
+        logs: bound logs; empty to skip sensors, which need samples.
+        builder: of the rows.
         problem: of all parts, for its scales and free parameters.
         dof_names: of the robot.
         rank_tolerance: as in `LeastSquares`.
@@ -380,7 +379,7 @@ def _factors_of_others(data: ScaledParts, groups: dict[str, list[int]], factors:
 
 
 def _without_each(factors: Sequence[Array]) -> Iterator[Array]:
-    """For each factor one of all others, merged from those before and those after it."""
+    """For each factor, the merged factor of all others."""
     empty = factors[0][:0]
     after = [empty]
     for factor in reversed(factors[1:]):

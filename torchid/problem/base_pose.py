@@ -1,4 +1,4 @@
-"""Pose of the base in logs without it, from the feet that stand on a floor: tilt and height, heading and place."""
+"""Pose of the base from the feet that stand on a floor, for logs without a pose."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchid.errors import LogError, about_file, warn
+from torchid.errors import LogError, about_file, format_count, warn
 from torchid.logs import Log
 from torchid.logs.log import NORMALS, BoolArray, FloatArray
 from torchid.logs.quaternion import make_sign_continuous
 from torchid.problem.log_joints import joint_order
-from torchid.problem.samples import require_contacts
+from torchid.problem.samples import ACTIVE, require_contacts
 from torchid.robot import Robot
 from torchid.sensing import Contact
 from torchid.sensing.sensors import UP
 
-FEET = "three point feet, one flat foot, or a line and another foot"
-"""Feet that say how a base stands above them, in messages."""
+FEET = "three point feet, one flat foot, or a line foot and another foot"
+"""Feet that determine the pose of the base, in messages."""
 
 FEWEST_POINTS = 3
 """Points that say how a floor lies."""
@@ -39,14 +39,13 @@ _SETTLED_M = 1e-13
 
 @dataclass(frozen=True)
 class LogWithPose:
-    """A log with the pose of the base wherever enough feet stand to say how it does.
+    """A log with the pose of the base where enough feet stand.
 
     Attributes:
-        log: with `base_quat_xyzw` and `base_position_world`, NaN where they are not known, and no other motion of the
-            base.
-        segments: of successive samples with a pose; nothing may be differentiated across their ends.
-        dropped: number of samples without a pose, by the reason.
-        uneven: rms distance of the feet that stand from one floor [m].
+        log: with `base_quat_xyzw` and `base_position_world`, NaN where unknown, and no other motion of the base.
+        segments: of successive samples with a pose. Do not differentiate across their ends.
+        dropped: number of samples without a pose, by reason.
+        uneven: rms distance of the standing feet from a common plane [m].
     """
 
     log: Log
@@ -56,49 +55,48 @@ class LogWithPose:
 
 
 def warn_of_pose(standing: LogWithPose, too_short: int) -> None:
-    """Say which samples are left out, some in segments that are too short, and whether feet are uneven."""
+    """Warn about dropped samples, `too_short` of them in short segments, and about feet that are off a common plane."""
     source = standing.log.source
     count = len(standing.log)
     dropped = standing.dropped | ({"segments too short to differentiate": too_short} if too_short else {})
     if dropped:
         reasons = ", ".join(f"{reason}: {number}" for reason, number in dropped.items())
-        what = f"{sum(dropped.values())} of {count} samples left out, base motion unknown"
-        warn(f"{source}: base_motion contacts: {what} ({reasons})")
+        what = f"{sum(dropped.values())} of {count} samples dropped: the feet do not determine the base pose"
+        warn(f"{source}: {what} ({reasons})")
     if standing.uneven > _MAX_UNEVEN_M:
-        what = f"feet that stand are {1e3 * standing.uneven:.2g} mm (rms) off one floor"
-        advice = "check joint zeros, contact flags, contacts' frames and radii"
-        warn(f"{source}: base_motion contacts: {what}; {advice}")
+        what = f"the standing feet are {1e3 * standing.uneven:.2g} mm (rms) off a common plane"
+        warn(f"{source}: {what}. Check joint zeros, contact flags, and the frames and radii of contacts")
 
 
 def longest_with_pose(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Log:
-    """The longest segment with the base's pose from the feet that stand; LogError as `base_pose_from_feet`."""
+    """The longest segment with a base pose from the standing feet; raises as `base_pose_from_feet`."""
     standing = base_pose_from_feet(log, robot, contacts)
     return standing.log.select(max(standing.segments, key=lambda segment: segment.stop - segment.start))
 
 
 def base_pose_from_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> LogWithPose:
-    """Pose of the base in the world from the feet that stand on a floor, which has the contacts' common normal.
+    """Compute the pose of the base from the feet that stand on a floor with the contacts' common normal.
 
-    The floor goes through the world's origin. Tilt and height follow from the feet of each sample alone, heading and
-    place from feet that keep theirs, or roll, while they stand; least squares over all feet. At the start of a segment
-    from which on no two points stay, the base's x axis lies above the world's: on a level floor the dynamics do not
-    depend on that, and on another only the first such segment has a pose.
+    The floor goes through the world's origin. Tilt and height follow from the feet of each sample. Heading and
+    horizontal position follow from feet that do not move, or roll, while they stand (least squares over all feet).
+    Where a segment begins without two such points, the base's x axis lies above the world's x axis. On a level floor
+    the dynamics do not depend on this choice; on a sloped floor only the first such segment has a pose.
 
-    A frame of a flat foot has one axis along the floor's normal, the nearest to the way up to the base; such frames
-    are equally high above the floor. A point or line with a radius is that high above it.
+    The frame of a flat foot has one axis along the floor's normal: the axis nearest to the direction up to the base.
+    All flat frames have the same height above the floor. A point or line with a radius is that high above it.
 
     Args:
-        log: as recorded; what it has of the base's motion is not used.
+        log: as recorded; its motion of the base is not used.
         robot: the robot.
         contacts: its feet, all with the same normal.
 
     Raises:
-        LogError: joints or contacts that are missing, no sample with enough feet, a foot without an axis along the
-            normal, or readings along axes of a world whose heading is unknown.
+        LogError: joints or contacts are missing, no sample has enough standing feet, a flat foot has no axis along the
+            normal, or readings are along world axes although the heading is unknown.
     """
     active = _standing_flags(log, contacts)
     if log.contact_wrench_world is not None:
-        refusal = "given, but preprocessing.base_motion: contacts knows no heading in the world"
+        refusal = "preprocessing.base_motion: contacts does not know the heading in the world"
         raise LogError(log.source, "contact_wrench_world", refusal, "contact_wrench_local, or a log without wrenches")
     _require_floor_normals(log, active, contacts)
     with about_file(log.source):
@@ -109,7 +107,7 @@ def base_pose_from_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> 
     known = np.isfinite(footholds.height)
     few = int((stands.sum(axis=1) < FEWEST_POINTS).sum())
     _require_some(log.source, active, known, few)
-    dropped = {"too few feet stand": few, "feet in a line": int((~known).sum()) - few}
+    dropped = {"too few standing feet": few, "standing feet on one line": int((~known).sum()) - few}
     odometry = LegOdometry(stands, contacts[0].normal)
     segments = list[slice]()
     quat = np.full((len(log), 4), np.nan)
@@ -121,7 +119,7 @@ def base_pose_from_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> 
             quat[samples] = make_sign_continuous(Rotation.from_matrix(rotation).as_quat())
             segments.append(samples)
         else:
-            lost = "heading on a floor that is not level"
+            lost = "heading unknown on a sloped floor"
             dropped[lost] = dropped.get(lost, 0) + samples.stop - samples.start
     fields: dict[str, Any] = {name: None for name in vars(log) if name.startswith(("base_", "imu_"))}
     fields |= {"imu_frame": "", "base_quat_xyzw": quat, "base_position_world": position, NORMALS: None}
@@ -131,39 +129,38 @@ def base_pose_from_feet(log: Log, robot: Robot, contacts: Sequence[Contact]) -> 
 
 
 def _standing_flags(log: Log, contacts: Sequence[Contact]) -> BoolArray:
-    """Which contacts stand, (N, C), by the flags of a log; LogError without any."""
+    """Which contacts stand, (N, C), by the flags of a log; LogError without flags."""
     if log.contact_active is None:
-        accepted = "(N, C) bool: which contact stands when; base_motion: contacts follows from it"
-        raise LogError(log.source, "contact_active", "missing", accepted)
+        raise LogError(log.source, "contact_active", "missing", ACTIVE)
     require_contacts(log.source, log.contact_names, contacts)
     return log.contact_active[:, [log.contact_names.index(contact.frame) for contact in contacts]]
 
 
 def _require_some(source: str, active: BoolArray, known: BoolArray, few: int) -> None:
-    """Refuse a log in whose samples nothing says how the base stands."""
+    """Raise LogError if no sample determines the pose of the base."""
     if known.any():
         return
     if not active.any():
         reason = "no contact stands in any sample"
     elif few == len(known):
         most = int(active.sum(axis=1).max())
-        reason = f"at most {most} of the contacts stand at once"
+        reason = f"at most {format_count(most, 'contact')} at the same time, too few for the base pose"
     else:
-        reason = "the feet that stand are in a line, about which the base may turn"
-    accepted = f"{FEET} on the floor, or preprocessing.base_motion: null for a log with the base's motion"
-    raise LogError(source, "contact_active", f"{reason}, though preprocessing.base_motion is contacts", accepted)
+        reason = "all standing feet are on one line, and the base could turn about it"
+    accepted = f"{FEET} on the floor; preprocessing.base_motion: null if the log has the base motion"
+    raise LogError(source, "contact_active", reason, accepted)
 
 
 def _require_floor_normals(log: Log, active: BoolArray, contacts: Sequence[Contact]) -> None:
-    """Refuse recorded normals of contacts that stand (N, C) which are not that of the floor."""
+    """Raise LogError if recorded normals of standing contacts (N, C) differ from that of the floor."""
     normals = log.contact_normal_world
     if normals is None:
         return
     columns = [log.contact_names.index(contact.frame) for contact in contacts]
     other = np.abs(normals[:, columns] - np.array([contact.normal for contact in contacts]))
     if (active & (other > _HEADING_TOLERANCE).any(axis=2)).any():
-        reason = "other normals than that of the contacts, though preprocessing.base_motion is contacts"
-        raise LogError(log.source, NORMALS, reason, "contacts[].normal of the one floor, or a log without the field")
+        reason = "differs from contacts[].normal, the one floor that preprocessing.base_motion: contacts assumes"
+        raise LogError(log.source, NORMALS, reason, "the same normal in both, or a log without this field")
 
 
 def feet_poses(log: Log, robot: Robot, contacts: Sequence[Contact]) -> dict[str, FloatArray]:
@@ -177,13 +174,13 @@ def feet_poses(log: Log, robot: Robot, contacts: Sequence[Contact]) -> dict[str,
 
 
 def points_of(contact: Contact) -> int:
-    """As how many points of a floor a contact counts."""
+    """Number of floor points that a contact counts as."""
     return {"point": 1, "line": 2, "flat": 4}[contact.kind]
 
 
 @dataclass(frozen=True)
 class StanceFoot:
-    """A contact, and in the base frame its rotation (N, 3, 3) and points (N, P, 3) [m] of a floor that it stands on."""
+    """A contact with, in the base frame, its rotation (N, 3, 3) and the floor points (N, P, 3) [m] below it."""
 
     contact: Contact
     rotation: FloatArray
@@ -191,10 +188,10 @@ class StanceFoot:
 
     @classmethod
     def of(cls, contact: Contact, pose: FloatArray, stands: BoolArray) -> StanceFoot:
-        """A foot with poses (N, 4, 4) in the base, and when it stands (N,).
+        """A foot with poses (N, 4, 4) in the base; `stands`: (N,) bool.
 
         Raises:
-            LogError: no axis of a flat foot's frame is near the way from it up to the base while it stands.
+            LogError: no axis of a flat foot's frame points to the base while it stands.
         """
         rotation = pose[:, :3, :3]
         origin = pose[:, :3, 3]
@@ -210,28 +207,28 @@ class StanceFoot:
 
 
 def _sole_axis(contact: Contact, rotation: FloatArray, origin: FloatArray) -> int:
-    """The axis of a flat foot's frame that is nearest to the way from it up to the base; LogError if none is near."""
+    """Axis of a flat foot's frame nearest to the direction up to the base; LogError if none is near."""
     way = -np.einsum("nji,nj->ni", rotation, origin).mean(axis=0)
     share = np.abs(way) / max(float(np.linalg.norm(way)), np.finfo(float).tiny)
     axis = int(share.argmax())
     if share[axis] < _ALONG:
         angle = float(np.degrees(np.arccos(share[axis])))
-        reason = f"the base is {angle:.0f} deg off the nearest axis of flat foot {contact.frame}"
-        accepted = "a frame with an axis normal to the sole, below the base, for preprocessing.base_motion: contacts"
+        reason = f"no axis of flat foot {contact.frame} points to the base (the nearest is {angle:.0f} deg off)"
+        accepted = "a frame with an axis normal to the sole and the base above it (preprocessing.base_motion: contacts)"
         raise LogError.at_field("contact_names", reason, accepted)
     return axis
 
 
 @dataclass(frozen=True)
 class Footholds:
-    """Feet of N successive samples above their floor, in the base frame; NaN where they do not say how it lies.
+    """Feet of N successive samples above their floor, in the base frame; NaN where the floor is unknown.
 
     Attributes:
         feet: the feet.
         points: of all feet, (N, P, 3) [m].
         up: unit vectors normal to the floor, (N, 3).
-        height: of the base's origin above it, (N,) [m].
-        uneven: rms distance from it of the points that stand, (N,) [m].
+        height: of the base's origin above the floor, (N,) [m].
+        uneven: rms distance of the standing points from the floor, (N,) [m].
     """
 
     feet: Sequence[StanceFoot]
@@ -242,7 +239,7 @@ class Footholds:
 
     @classmethod
     def of(cls, feet: Sequence[StanceFoot], stands: BoolArray) -> Footholds:
-        """Of feet of whose P points these stand, (N, P), each on a ball."""
+        """From feet with P points; `stands`: (N, P) bool."""
         points = np.concatenate([foot.points for foot in feet], axis=1)
         radius = np.concatenate([np.full(foot.points.shape[1], foot.contact.radius) for foot in feet])
         up, height, uneven = np.full((len(points), 3), np.nan), *np.full((2, len(points)), np.nan)
@@ -299,17 +296,17 @@ def split_at_lost_feet(stands: BoolArray, known: BoolArray) -> Iterator[list[sli
 
 
 class LegOdometry:
-    """Heading and place of a base above feet that keep theirs, or roll, while they stand."""
+    """Heading and horizontal position of a base above feet that do not move, or roll, while they stand."""
 
     def __init__(self, stands: BoolArray, normal: Sequence[float]) -> None:
-        """Stand on feet of whose P points these stand, (N, P), on a floor with a normal (3,)."""
+        """Start with points that stand, (N, P) bool, on a floor with a normal (3,)."""
         self._stands = stands
         self._normal = np.array(normal)
         self._places = np.full((stands.shape[1], 2), np.nan)  # where points stood at the last sample so far
         self._last = 0  # first sample after it
 
     def begin(self, start: int) -> bool:
-        """Forget points that were lifted before a segment; whether those that are left tell its heading."""
+        """Forget points that were lifted before a segment; return whether the other points determine its heading."""
         stayed = self._stands[self._last : start + 1].all(axis=0)
         self._places[~stayed] = np.nan
         return bool(np.isfinite(self._places).all(axis=1).sum() >= 2)
@@ -343,7 +340,7 @@ class LegOdometry:
     def _follow(
         self, runs: Sequence[slice], levelled_base: FloatArray, flat: FloatArray, rolled: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Headings (M,) and places (M, 2) [m] of the base, and final ones (P, 2) of points that have rolled so far."""
+        """Headings (M,) and positions (M, 2) [m] of the base, and final positions (P, 2) of rolling points."""
         offset = runs[0].start
         anchor = self._places - rolled[0]
         yaw = np.empty(len(rolled))
@@ -380,7 +377,7 @@ class LegOdometry:
 
 
 def _rolled(feet: Sequence[StanceFoot], rotation: FloatArray) -> FloatArray:
-    """How far the points of feet have rolled along the floor since the first sample, (M, P, 2) [m].
+    """Distance that the points of feet have rolled along the floor since the first sample, (M, P, 2) [m].
 
     Args:
         feet: at M samples.
@@ -430,13 +427,13 @@ def _rotation_between(start: FloatArray, end: FloatArray) -> FloatArray:
 
 
 def rolled_distance(rotation: FloatArray, radius: float, normal: FloatArray, axis: str | None = None) -> FloatArray:
-    """How far the origin of a frame goes that rolls without slipping, (N, 3) [m], from the first sample on.
+    """Displacement of the origin of a frame that rolls without slipping, (N, 3) [m], from the first sample on.
 
     Args:
         rotation: of the frame to the world, (N, 3, 3).
         radius: of the sphere or cylinder about its origin [m].
         normal: of the ground, (3,) or (N, 3).
-        axis: x, y or z of the frame, along which a cylinder is; None for a sphere.
+        axis: x, y or z, the cylinder's axis in the frame; None for a sphere.
     """
     normals = np.broadcast_to(normal, (len(rotation), 3))
     if axis is not None:

@@ -25,13 +25,12 @@ _MEMORY = 2**30  # [bytes] of rows that are cached from epoch to epoch
 
 @dataclass(frozen=True)
 class Batch:
-    """Projected and whitened rows of B samples: `K @ (columns @ phi)` is to equal `f`.
+    """Projected and whitened rows of B samples. A fit makes `K @ (columns @ phi)` equal to `f`.
 
     Attributes:
-        K: (B, n_rows, P'), `W^T K`, in the columns of the `MiniBatches` it came from; rows of zeros where a sample has
-            fewer.
+        K: (B, n_rows, P'), `W^T K`, in the columns of `MiniBatches`; padded with rows of zeros.
         f: (B, n_rows), `W^T f`, in standard deviations of the sensor noise.
-        W: (B, n_rows, n_rows), projects any further generalized force r, (B, n_rows) [N, N m], to these rows: `W^T r`.
+        W: (B, n_rows, n_rows), maps a generalized force r, (B, n_rows) [N, N m], to these rows: `W^T r`.
         q, v, a: generalized coordinates as in `Samples.coordinates`.
     """
 
@@ -60,10 +59,11 @@ class Batch:
 
 
 class MiniBatches:
-    """Mini-batches of some logs.
+    """Shuffled mini-batches of logs.
 
-    Samples are assigned at random, once, to chunks whose rows are computed together and cached if memory allows. Every
-    epoch shuffles the chunks and the samples within each; the order depends only on the seed and the epoch's number.
+    Samples are randomly assigned, once, to chunks. The rows of a chunk are computed together, and cached if memory
+    allows. Every epoch shuffles the chunks and the samples in each. The order depends only on the seed and the epoch
+    number.
     """
 
     def __init__(
@@ -81,18 +81,18 @@ class MiniBatches:
         Args:
             logs: bound logs.
             builder: of the rows; batches are on its device.
-            batch_size: samples per batch; the last of a chunk may hold fewer.
+            batch_size: samples per batch; the last batch of a chunk may have fewer.
             seed: of all random orders.
-            memory: bytes of rows to cache; the others are computed again in each epoch.
-            share: number of this process, and of all that share every batch: it takes every so-many-th sample of
-                a chunk, and batches hold what is in them of these.
-            assembly: from `assemble`, of these logs: their extra parameters are the best for the parameters of the
-                bodies, as in its problem, whose `terms` have columns of their own, last.
+            memory: bytes of rows to cache; other rows are recomputed in each epoch.
+            share: (k, n): process k of n, which share every batch. This process takes every n-th sample.
+            assembly: result of `assemble` for these logs; needed if the builder has extra parameters. These take their
+                best values for the bodies' parameters. The `terms` of its problem are the last columns.
+
+        Raises:
+            ValueError: `batch_size` is below 1, or `assembly` is missing.
         """
         if batch_size < 1:
             raise ValueError(f"batch_size: found {batch_size}; accepted: at least 1")
-        if builder.extras and assembly is None:
-            raise ValueError("builder: found extra terms; accepted: one without, or an assembly")
         self.builder = builder
         self.batch_size = batch_size
         self.seed = seed
@@ -112,14 +112,14 @@ class MiniBatches:
         self._memory_left = memory
 
     def __repr__(self) -> str:
-        return f"MiniBatches: {self.samples} samples of {len(self._logs)} logs, {self.batch_size} a batch"
+        return f"MiniBatches: {self.samples} samples from {len(self._logs)} logs, {self.batch_size} per batch"
 
     def epoch(self, number: int) -> Iterator[Batch]:
         """All samples in the order of an epoch, numbered from 1."""
         return (batch for batch, _ in self.sized_epoch(number))
 
     def sized_epoch(self, number: int) -> Iterator[tuple[Batch, int]]:
-        """As `epoch`, each batch with the number of samples that all processes together have in it."""
+        """As `epoch`, each batch with the number of its samples in all processes together."""
         generator = self._generator(number)
         rank, size = self.share
         for chunk in torch.randperm(len(self._chunks), generator=generator).tolist():
@@ -134,12 +134,12 @@ class MiniBatches:
         return (batch for batch, _ in self.sized_chunks())
 
     def sized_chunks(self) -> Iterator[tuple[Batch, int]]:
-        """As `chunks`, each with the number of samples that all processes together have in it."""
+        """As `chunks`, each with the number of its samples in all processes together."""
         return ((self._rows(number), len(chunk)) for number, chunk in enumerate(self._chunks))
 
     @torch.no_grad()
     def generalized_forces(self, phi: Array) -> Iterator[tuple[tuple[Tensor, Tensor, Tensor], Tensor]]:
-        """Coordinates (q, v, a) of samples, log by log, with K phi, (B, n_rows) [N, N m], of parameters (12 L,)."""
+        """Coordinates (q, v, a) and forces K phi, (B, n_rows) [N, N m], of parameters (12 L,), log by log."""
         columns = self.builder.to_columns(phi[None])
         for log in self._logs:
             for start in range(0, len(log), _CHUNK):
@@ -187,12 +187,12 @@ class MiniBatches:
         return Batch(rows[..., :-1], rows[..., -1], W, *samples.coordinates())
 
     def _elimination(self, source: str) -> Tensor:
-        """What takes rows of a log with its extra parameters, (width + 1,), to those without, right-hand side last.
+        """Matrix that maps rows of a log with extra parameters, (width + 1,), to rows without; right-hand side last.
 
-        Extra parameters are psi = inverse (z - C x), as in `Elimination`; terms that conditions bound are columns.
+        Extra parameters are psi = inverse (z - C x), as in `Elimination`; terms with conditions stay as columns.
         """
         if self.assembly is None:
-            raise ValueError("assembly: found None; accepted: one that eliminates the extra parameters")
+            raise ValueError("assembly: found None; accepted: a result of assemble (builder has extra parameters)")
         parameter_map = self.builder.columns.parameter_map
         kept = len(self.columns)
         rhs = np.eye(1, kept + 1, kept)

@@ -101,7 +101,7 @@ def choose_kernels(builder: RowBuilder, samples: int) -> None:
         try:
             from torchid.problem.compiled_rows import CompiledRows  # loads what shorter logs do without
         except (ImportError, RuntimeError) as error:
-            warn(f"Numba: {excerpt(str(error))}; rows are made without it, which takes twice as long")
+            warn(f"Numba does not load ({excerpt(str(error))}). Compression runs without it and takes twice as long")
             return
         builder.compiled = CompiledRows(builder)
 

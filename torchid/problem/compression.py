@@ -84,14 +84,14 @@ def merge_factors(factors: Iterable[TriangularFactor], builder: RowBuilder) -> T
 
 
 def merge(parts: Sequence[Part], builder: RowBuilder, *by: str) -> list[Part]:
-    """One part, on the CPU, of all that agree in some fields of `Part`; the parts themselves stay as they are.
+    """Merge all parts that agree in some fields of `Part`, on the CPU; the given parts do not change.
 
-    A part of several contact states or folds has those of the first; without "block" its block is 0.
+    The merged part has the contact state and fold of its first part. Without "block" in `by` its block is 0.
 
     Args:
-        parts: of some logs.
-        builder: of their rows.
-        by: names of fields; equations of unloaded sensors should stay apart.
+        parts: of logs.
+        builder: that made the rows.
+        by: names of fields. Keep equations of unloaded sensors apart.
     """
     alike: dict[tuple[object, ...], list[Part]] = {}
     for part in parts:
@@ -110,15 +110,15 @@ def merge(parts: Sequence[Part], builder: RowBuilder, *by: str) -> list[Part]:
 
 
 def split_into_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
-    """The logs, in order, cut into blocks contiguous in time, with the fold of each.
+    """Cut logs, in order, into blocks that are contiguous in time, and assign each to a cross-validation fold.
 
-    Errors of successive samples are correlated: samples drawn at random would test a fit on its training data. A log is
-    cut in proportion to its share of all samples; where there are many, whole logs are held out. Folds are fewer, down
-    to a single one, if there are too few samples or too little memory for their factors.
+    Successive errors are correlated, so randomly drawn samples would test a fit on its training data. A log is cut in
+    proportion to its share of all samples. With many logs, whole logs are held out. There are fewer folds, down to one,
+    if samples or memory are short.
 
     Args:
         logs: bound logs.
-        builder: of their rows.
+        builder: that makes the rows.
     """
     independent = sum(len(log) / log.oversampling for log in logs)
     count = _fold_count(independent, _count_states(logs), builder)
@@ -194,10 +194,7 @@ def compress(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> TriangularFactor:
-    """Stream all samples of some logs into one triangular factor.
-
-    Args: as `map_chunks`.
-    """
+    """Compress all samples of logs into one triangular factor, in one pass. Arguments as in `map_chunks`."""
     return merge_factors((part.factor for part in compress_parts(logs, builder, chunk, threads, progress)), builder)
 
 
@@ -209,10 +206,10 @@ def compress_parts(
     progress: ProgressCallback | None = None,
     weight_rows: RowWeighting | None = None,
 ) -> list[Part]:
-    """As `compress`, but with a factor for every contact state in every log, fold and block, in the order of the logs.
+    """As `compress`, with one factor for every contact state, fold and block of every log, in the order of the logs.
 
-    Logs of one source count as one. Unknown offsets of contact sensors have further parts, of readings in the air.
-    `weight_rows` weights all other rows before they are added; their factors then have no noise Gram matrix, see
+    Logs with the same source count as one. If contact sensors have unknown offsets, readings in the air make further
+    parts. `weight_rows` weights all other rows before they are added; their factors then have no noise Gram matrix, see
     `add_noise_gram`.
     """
 
@@ -239,13 +236,13 @@ def compress_in_blocks(
     progress: ProgressCallback | None = None,
     weight_rows: RowWeighting | None = None,
 ) -> list[Part]:
-    """As `compress_parts`, but each fold in blocks of successive samples, whose scatter widens standard errors.
+    """As `compress_parts`, with each fold cut into blocks of successive samples. Their scatter widens standard errors.
 
-    Blocks are about equally long, some `BLOCKS` in all; fewer where samples or memory are short.
+    The blocks are about equally long, `BLOCKS` in all, or fewer if samples or memory are short.
 
     Args:
-        logs: as `split_into_folds` cuts them.
-        builder: of their rows.
+        logs: from `split_into_folds`.
+        builder: that makes the rows.
         progress: called with the number of samples done.
         weight_rows: as in `compress_parts`.
     """
@@ -372,22 +369,20 @@ def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part
 
 @dataclass(frozen=True)
 class CompressedLog:
-    """Factors of a log, in pieces that make up as many blocks as a fit with other logs may cut it into.
+    """Factors of one log, in pieces that later fits merge to blocks.
 
-    Blocks are those of `split_into_folds`: one for a log among many, several for a long one. Factors of pieces merge
-    into those of blocks. Equations of readings in the air do not, as they come from means over whole blocks: they are
-    there for every block of every number of blocks. No fit needs a contact state of a piece: a piece has all of them in
-    one factor, and each contact state has one of the whole log, which takes a fraction of the room.
+    Blocks are those of `split_into_folds`: one for a log among many, several for a long log. Equations of readings in
+    the air are means over whole blocks, so they are stored for every block of every number of blocks. A piece has one
+    factor for all contact states. Each contact state has one factor for the whole log.
 
     Attributes:
         source: name of the log.
-        samples: their number.
-        oversampling: of the samples, as `Samples` has it.
-        noise_left: likewise.
-        blocks: their largest number.
-        pieces: a factor of each of `piece_spans`, all contact states together, in time.
-        by_state: a factor of each contact state of the whole log.
-        unloaded: equations of readings in the air, by the block that they are of.
+        samples: number of samples.
+        oversampling, noise_left: as in `Samples`.
+        blocks: largest number of blocks.
+        pieces: a factor for each of `piece_spans`, in time order.
+        by_state: a factor for each contact state of the whole log.
+        unloaded: equations of readings in the air, by block.
     """
 
     source: str
@@ -402,7 +397,7 @@ class CompressedLog:
     __repr__ = short_repr
 
     def _headline(self) -> str:
-        return f"{self.rows} equations of {self.samples} samples, up to {self.blocks} blocks"
+        return f"{self.rows} equations from {self.samples} samples in up to {self.blocks} blocks"
 
     def __len__(self) -> int:
         return self.samples
@@ -423,14 +418,14 @@ class CompressedLog:
 
 @dataclass(frozen=True)
 class CompressedBlock:
-    """A block of a compressed log in a fold, which stands in for its samples.
+    """A block of a compressed log in a fold; it replaces the samples.
 
     Attributes:
         source: name of the log.
         fold: number of the fold.
-        samples: their number.
-        noise_left: as `Samples` has it.
-        parts: one with all contact states, whose own state means nothing, and equations of readings in the air.
+        samples: number of samples.
+        noise_left: as in `Samples`.
+        parts: one factor for all contact states (its `state` has no meaning), and equations of readings in the air.
     """
 
     source: str
@@ -454,17 +449,19 @@ def piece_spans(samples: int, blocks: int) -> list[SampleSpan]:
 
 
 def compress_log(log: Samples, builder: RowBuilder, progress: ProgressCallback | None = None) -> CompressedLog:
-    """Compress one log for later fits with others.
+    """Compress one log, to fit it later together with others.
 
-    As `split_into_folds` and `compress_parts` do for logs that are all there::
+    For example::
 
         compressed = [torchid.compress_log(log, builder) for log in logs]
         blocks = torchid.fold_compressed(compressed, builder)
         fit = fitter.fit([part for block in blocks for part in block.parts])
 
+    The result equals that of `split_into_folds` and `compress_parts` for logs that are all in memory.
+
     Args:
         log: a bound log.
-        builder: of its rows.
+        builder: that makes the rows.
         progress: called with the number of samples done.
     """
     folds = round(len(log) / log.oversampling / LEAST_PER_FOLD)  # rounded, as its share of the folds of a fit is
@@ -491,11 +488,11 @@ def compress_log(log: Samples, builder: RowBuilder, progress: ProgressCallback |
 
 
 def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[CompressedBlock]:
-    """The logs, in order, in blocks with folds: those that `split_into_folds` makes of their samples.
+    """Cut compressed logs, in order, into the blocks and folds that `split_into_folds` makes of their samples.
 
     Args:
-        logs: compressed logs, of different names.
-        builder: of their rows.
+        logs: compressed logs with different names.
+        builder: that made the rows.
     """
     independent = sum(len(log) / log.oversampling for log in logs)
     count = _fold_count(independent, sum(len(log.by_state) for log in logs), builder)

@@ -1,7 +1,7 @@
-"""Which contacts stand when, from joint torques and the robot's own dynamics.
+"""Detection of standing contacts from joint torques and the robot's dynamics.
 
-A log is filtered (`prepare`), forces of the ground follow from its torques and dynamics (`ForcesAlongNormals`), and
-contacts stand by thresholds on these (`detect_contacts`); parameters that fit the log then make both finer.
+A log is filtered (`prepare`). Ground forces follow from its torques and dynamics (`ForcesAlongNormals`). Thresholds on
+these decide which contacts stand (`detect_contacts`). Parameters fitted to the log then refine both.
 """
 
 from __future__ import annotations
@@ -388,21 +388,22 @@ class DetectionSamples:
 
 
 def prepare(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> DetectionSamples:
-    """A log as recorded, with joint torques, prepared for detection.
+    """Prepare a recorded log with joint torques for detection.
 
-    A base of which neither pose nor IMU was recorded counts as still, and tilted as if all feet stood.
+    Without a pose and an IMU, the base counts as still, with the tilt at which all feet stand.
 
     Args:
         log: as recorded; gaps are interpolated.
-        robot: the robot, whose base floats.
+        robot: with a floating base.
         contacts: that may stand.
-        cutoff_hz: of the filter [Hz]; there is none from half the log's sample rate on.
+        cutoff_hz: of the filter [Hz]; no filter from half the log's sample rate on.
 
     Raises:
-        InputError: no torques, fewer than three of joints above a contact, joints that are missing, or as `preprocess`.
+        InputError: the log has no torques, fewer than three measured joints above a contact, or lacks joints; also as
+            `preprocess`.
     """
     if log.joint_torque is None:
-        raise LogError(log.source, "joint_torque", "missing", "the field, from which preprocessing.detect_contacts is")
+        raise LogError(log.source, "joint_torque", "missing", "the field; preprocessing.detect_contacts needs it")
     is_filtered = cutoff_hz < (1.0 - JITTER) * nyquist_hz(log.time)
     with warnings.catch_warnings():  # noise and gaps are warned of where the log is read for its own sake
         warnings.simplefilter("ignore", TorchidWarning)
@@ -428,7 +429,7 @@ def nyquist_hz(time: FloatArray) -> float:
 
 
 def _require_torques(log: Log, robot: Robot, contacts: Sequence[Contact], measured: BoolArray) -> None:
-    """Refuse a log in which fewer than three joints above a contact have a torque, of which measured are (n,)."""
+    """Raise LogError if fewer than three joints above a contact have a torque; `measured`: (n,)."""
     for contact in contacts:
         above = set[str]()
         body = robot.links[contact.frame][0]
@@ -437,13 +438,13 @@ def _require_torques(log: Log, robot: Robot, contacts: Sequence[Contact], measur
             body = joint.parent
         of_contact = [name for name, known in zip(robot.joint_names, measured, strict=True) if known and name in above]
         if len(of_contact) < _FEWEST_TORQUES:
-            reason = f"measured at {', '.join(of_contact) or 'no joint'} alone above {contact.frame}"
-            accepted = f"torques of {_FEWEST_TORQUES} joints or more above each contact, for detect_contacts"
+            reason = f"above {contact.frame}, measured only at {', '.join(of_contact) or 'no joint'}"
+            accepted = f"torques of at least {_FEWEST_TORQUES} joints above each contact, for detect_contacts"
             raise LogError(log.source, "joint_torque", reason, accepted)
 
 
 def _for_detection(log: Log) -> Log:
-    """The log without contacts and with its gaps interpolated; torques with many are NaN throughout."""
+    """The log without contacts and with gaps interpolated; torque channels with many gaps become NaN."""
     fields: dict[str, Any] = {name: None for name in vars(log) if name.startswith(("contact_", "ft_"))}
     fields |= {"contact_names": (), "ft_names": ()}
     filled = {
@@ -481,7 +482,7 @@ def _rotation(quat: FloatArray) -> FloatArray:
 
 
 def _if_all_stand(log: Log, robot: Robot, contacts: Sequence[Contact]) -> FloatArray:
-    """Rotations (N, 3, 3) of the base as if all feet stood, near enough for their load; else its z axis points up."""
+    """Approximate rotations (N, 3, 3) of the base as if all feet stood; otherwise its z axis points up."""
     frames = tuple(contact.frame for contact in contacts)
     flags = np.ones((len(log), len(contacts)), dtype=bool)
     bare = Log(log.source, log.time, log.joint_names, log.joint_position, contact_names=frames, contact_active=flags)
@@ -510,23 +511,23 @@ def _filled(values: FloatArray) -> FloatArray:
 
 @dataclasses.dataclass(frozen=True)
 class ForcesAlongNormals:
-    """Forces along the ground's normal by the URDF's dynamics, with the armature and friction (m, 3) of a log's joints.
+    """Ground forces along the normal from the URDF's dynamics, with armature and friction (m, 3) of a log's joints.
 
-    Of all wrenches of all contacts, as if each could carry, those that balance measured joint torques, gravity and
-    inertia best, weighted least squares over the joints' and the base's rows. A base of which neither pose nor IMU was
-    recorded counts as still, and tilted as if all feet stood.
+    The wrenches of all contacts are those that balance measured joint torques, gravity and inertia best (weighted least
+    squares over joint and base rows), as if every contact could stand. Without a pose and an IMU, the base counts as
+    still, with the tilt at which all feet stand.
 
     Attributes:
-        robot: with the parameters by which they are worked out.
+        robot: with the parameters used.
         contacts: read along the axes of their frames.
         builder: of rows of the measured joints.
-        rows: of the base and the joints whose torques were measured throughout, (6 + n,).
+        rows: of the base and the joints with measured torques, (6 + n,).
         error: standard deviations of these rows [N, N m].
         weight: of the robot [N].
         actuators: armature, Coulomb and viscous friction.
-        chosen: numbers (M,) of the evenly spaced samples of which these are.
-        samples: those samples, in which all contacts stand.
-        unexplained: (M,) [N], size of the force on the base that contact forces do not make up.
+        chosen: numbers (M,) of evenly spaced samples.
+        samples: these samples, in which all contacts stand.
+        unexplained: (M,) [N], norm of the base force that contact forces do not balance.
     """
 
     robot: Robot
@@ -544,7 +545,7 @@ class ForcesAlongNormals:
     def of(
         cls, known: DetectionSamples, robot: Robot, contacts: Sequence[Contact], sign_width: float | None = None
     ) -> ForcesAlongNormals:
-        """Of a log, with friction whose sign is so wide [rad/s or m/s]."""
+        """From a log; `sign_width` of friction [rad/s or m/s]."""
         torque = known.samples.torque
         rms = np.full(robot.n, np.nan)
         if torque is not None:
@@ -577,7 +578,7 @@ class ForcesAlongNormals:
         return dataclasses.replace(forces, actuators=actuators, unexplained=np.linalg.norm(unbalanced, axis=1))
 
     def with_parameters(self, nominal: FloatArray, armature: FloatArray) -> ForcesAlongNormals:
-        """Those of the robot with other parameters (L, 12), and armatures (m,) of joints whose torque was measured."""
+        """The same with other parameters (L, 12), and armatures (m,) of joints with a measured torque."""
         robot = dataclasses.replace(self.robot, nominal=nominal)
         return dataclasses.replace(self, robot=robot, actuators=np.outer(armature, [1.0, 0.0, 0.0]))
 
@@ -626,13 +627,13 @@ class ForcesAlongNormals:
 
 @dataclasses.dataclass(frozen=True)
 class _Balance:
-    """Whitened balances of M samples.
+    """Whitened force balances of M samples.
 
     Attributes:
-        maps: of the k components of contact forces to rows, (M, rows, k).
-        missing: what contact forces have to make up, (M, rows).
-        solver: of that to the components, (M, k, rows).
-        terms: acceleration, smoothed sign of the velocity and velocity by joint whose torque was measured, (M, m, 3).
+        maps: from the k components of contact forces to rows, (M, rows, k).
+        missing: forces that contacts have to balance, (M, rows).
+        solver: from these to the components, (M, k, rows).
+        terms: acceleration, smoothed sign of the velocity and velocity of joints with a measured torque, (M, m, 3).
         normals: of the ground in the frame of each contact, (M, 3).
     """
 
@@ -643,14 +644,14 @@ class _Balance:
     normals: list[FloatArray]
 
     def missing_with(self, actuators: FloatArray) -> FloatArray:
-        """What contact forces have to make up, (M, rows), with armature and friction (m, 3)."""
+        """Forces that contacts have to balance, (M, rows), with armature and friction (m, 3)."""
         out = self.missing.copy()
         out[:, 6:] += (self.terms * actuators).sum(axis=2)
         return out
 
 
 def _fit_actuators(balance: _Balance) -> FloatArray:
-    """Armature, Coulomb and viscous friction (m, 3) by joint, from what no contact force can make up."""
+    """Armature, Coulomb and viscous friction (m, 3) by joint, from the part that contact forces cannot balance."""
     joints = balance.terms.shape[1]
     inside = balance.maps @ balance.solver
     projector = (np.eye(inside.shape[1]) - inside)[:, 6:]
@@ -672,11 +673,11 @@ _PASSES = 3  # over the variance of what the parameters leave, which settles at 
 
 
 def fitted_parameters(samples: Samples, builder: RowBuilder, robot: Robot) -> tuple[FloatArray, FloatArray]:
-    """Parameters (L, 12) of a robot, and armatures (m,) of its joints, neither friction nor armatures below zero.
+    """Fit parameters (L, 12) of a robot and armatures (m,) of its joints; friction and armatures are at least 0.
 
     Args:
-        samples: with joint torques and the contacts that stand.
-        builder: of rows, whose extra parameters are armatures.
+        samples: with joint torques and the standing contacts.
+        builder: of rows, with armatures as extra parameters.
         robot: for the prior.
     """
     with distributed.apart():  # each process has logs of its own
@@ -689,9 +690,9 @@ def fitted_parameters(samples: Samples, builder: RowBuilder, robot: Robot) -> tu
 
 
 def most_probable(problem: LinearProblem) -> FloatArray:
-    """Parameters (P,) that are most probable by data and nominal values, with the noise that the data themselves show.
+    """Most probable parameters (P,) given data and nominal values, with the noise estimated from the data.
 
-    The prior is that of `PRIOR_DEVIATION`; MacKay, Bayesian Interpolation, 1992, with the prior's width known.
+    The prior is that of `PRIOR_DEVIATION`; MacKay, Bayesian Interpolation, 1992, with known width of the prior.
     """
     unit = problem.scale[problem.free] * PRIOR_DEVIATION
     A = problem.A[:, problem.free] * unit

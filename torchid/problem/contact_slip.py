@@ -1,4 +1,4 @@
-"""Slip: contacts that move on the ground while their flags say that they stand, and contacts that keep still."""
+"""Slip: contacts that move on the ground although their flags are set, and contacts that do not move."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class Slip:
     """Speed of the contacts on the ground.
 
     Attributes:
-        speed: (N, C) [m/s], of the material point that touches; NaN where it is not known or the contact does not
-            stand, or was about to change.
-        limits: (C,) [m/s], above which a contact slips.
-        relative: whether speeds are against the other contacts that stand, as the base's velocity was not recorded.
+        speed: (N, C) [m/s], of the material point that touches the ground; NaN where unknown, in the air, or near a
+            change.
+        limits: (C,) [m/s]; a contact slips above.
+        relative: whether speeds are relative to the other standing contacts, because the base's velocity is unknown.
         frames: of the contacts.
     """
 
@@ -63,9 +63,9 @@ class Slip:
         return bool(np.isfinite(self.speed).any())
 
     def __str__(self) -> str:
-        """How many samples of which contacts slip, "" for none."""
+        """Number of samples in which contacts slip, by contact; "" for none."""
         named = [
-            f"{frame} in {slipping.sum()} samples (up to {speed[slipping].max():.2g} m/s, more than {limit:.2g})"
+            f"{frame} in {slipping.sum()} samples (up to {speed[slipping].max():.2g} m/s, limit {limit:.2g} m/s)"
             for frame, slipping, speed, limit in zip(self.frames, self.slips.T, self.speed.T, self.limits, strict=True)
             if slipping.any()
         ]
@@ -82,22 +82,22 @@ def measure_slip(
     cutoff_hz: float | None = None,
     base_is_derived: bool = False,
 ) -> Slip:
-    """Speeds of the contacts that stand on the ground, of a log and its samples.
+    """Measure the speed of standing contacts on the ground.
 
-    The velocity of a contact that rolls is that of the material point at the ground. Where the log has the velocity of
-    its base it is that in the world; else it is that against the median of all contacts that stand (the base's linear
-    velocity is in each alike), known from two contacts on; of two that move apart both count.
+    For a rolling contact it is the speed of the material point at the ground. With a recorded base velocity it is the
+    speed in the world. Otherwise it is relative to the median of all standing contacts (the base's velocity cancels),
+    from two contacts on; if two move apart, both count as moving.
 
     Args:
         log: preprocessed.
         samples: bound from it, one for one.
-        recorded: the log with its flags as recorded; contacts count as standing away from their changes alone.
+        recorded: the log with its recorded flags; samples near a change of a contact's flag do not count.
         robot: the robot.
         contacts: of the samples.
-        limit: [m/s] above which a contact slips; None for six standard deviations of each contact's velocity while it
-            stands, by its median, and at least `LEAST_LIMIT`.
-        cutoff_hz: of the filter, which spreads what happens at a change over its inverse; None for no filter.
-        base_is_derived: whether the base's motion follows from the contacts themselves.
+        limit: [m/s] above which a contact slips; None for six (robust) standard deviations of its velocity while it
+            stands, at least `LEAST_LIMIT`.
+        cutoff_hz: of the filter, which spreads a change over 1 / cutoff_hz; None for no filter.
+        base_is_derived: whether the base's motion was computed from the contacts.
     """
     base = None if base_is_derived else base_velocity(log, samples)
     is_relative = base is None and not robot.fixed_base
@@ -159,7 +159,7 @@ def contact_velocities(samples: Samples, robot: Robot, contacts: Sequence[Contac
 def _away_from_own_changes(
     recorded: Log, time: FloatArray, contacts: Sequence[Contact], cutoff_hz: float | None
 ) -> BoolArray:
-    """Which contacts are away from their own changes, as recorded, at stamps (N,) [s] of a preprocessed log, (N, C)."""
+    """Which contacts are away from changes of their own recorded flag, at stamps (N,) [s], (N, C)."""
     away = np.ones((len(time), len(contacts)), dtype=bool)
     margin = _STENCIL * float(np.median(np.diff(recorded.time))) + (0.0 if cutoff_hz is None else 1.0 / cutoff_hz)
     if recorded.contact_active is None:
@@ -173,18 +173,18 @@ def _away_from_own_changes(
 
 
 def warn_of_slip(slip: Slip, source: str) -> None:
-    """Say in which samples of a log contacts slip, which are dropped, or that nothing says whether they do."""
+    """Warn about dropped samples in which contacts slip, or that slip cannot be checked."""
     slipping = slip.slips.any(axis=1)
     if not slip.checked:
-        needed = "needs the base's linear velocity or two contacts that stand"
-        warn(f"{source}: slip is not checked: it {needed}, away from changes of contact")
+        needed = "The check needs the base's linear velocity, or two contacts that stand at the same time"
+        warn(f"{source}: contact slip is not checked. {needed}")
     elif slipping.any():
-        count = f"{int(slipping.sum())} of {len(slip.speed)} samples dropped, in which contacts slip"
-        warn(f"{source}: {count}: {slip}; null as preprocessing.max_slip keeps them")
+        count = f"{int(slipping.sum())} of {len(slip.speed)} samples dropped because contacts slip"
+        warn(f"{source}: {count}: {slip}. To keep these samples, set preprocessing.max_slip: null")
 
 
 def _against_others(velocity: FloatArray) -> FloatArray:
-    """Velocities (N, C, 3), NaN where a contact does not stand, against those that stand; NaN of one alone."""
+    """Velocities (N, C, 3) relative to the other standing contacts; NaN in the air and for a single one."""
     count = np.isfinite(velocity[:, :, 0]).sum(axis=1)
     out = np.full_like(velocity, np.nan)
     two = count == 2
@@ -199,15 +199,15 @@ def _against_others(velocity: FloatArray) -> FloatArray:
 def keep_still(
     velocity: FloatArray, in_world: bool, standing: BoolArray, possible: BoolArray, shortest: int
 ) -> BoolArray:
-    """Which contacts that may stand move no faster than those that surely do, for some samples at least, (N, C).
+    """Which possible contacts move no faster than certain ones for at least `shortest` samples, (N, C).
 
     Args:
         velocity: of the contacts (N, C, 3) [m/s], from `contact_velocities`.
-        in_world: whether that is in the world, as the log has the velocity of its base; else speeds are those against
-            the median of the other contacts that surely stand.
-        standing: those that surely stand, (N, C).
-        possible: those that may stand, (N, C).
-        shortest: samples in a row.
+        in_world: whether this is the velocity in the world (recorded base velocity); otherwise speeds are relative to
+            the median of the other certain contacts.
+        standing: certain contacts, (N, C).
+        possible: possible contacts, (N, C).
+        shortest: number of successive samples.
     """
     speed = np.linalg.norm(velocity if in_world else _against_standing(velocity, standing), axis=2)
     noise = speed[standing & np.isfinite(speed)]
@@ -218,7 +218,7 @@ def keep_still(
 
 
 def _against_standing(velocity: FloatArray, standing: BoolArray) -> FloatArray:
-    """Velocities (N, C, 3) against the median of the other contacts that stand; NaN where none does."""
+    """Velocities (N, C, 3) relative to the median of the other standing contacts; NaN without any."""
     out = np.full_like(velocity, np.nan)
     for contact in range(velocity.shape[1]):
         others = np.where(standing[:, :, None], velocity, np.nan)

@@ -1,9 +1,9 @@
 """Columns of the rows and, for each contact state, their layout: coupled joints, wrenches of contacts, blocks of rows.
 
-Rows `W^T [K | f]` stay those of one problem when W is multiplied by any orthogonal matrix from the right. That freedom
-is used for zeros, as a factorization takes time with the square of the columns: at most three rows combine the moment
-on the base, the next three its force, but not its moment, so that inertias of bodies which no coupled joint moves are
-not in them, and all others combine joints alone.
+Rows `W^T [K | f]` pose the same problem if W is multiplied by any orthogonal matrix from the right. This freedom is
+used to create zeros, because the time of a factorization grows with the square of the columns. At most three rows
+combine the moment on the base. The next three combine its force but not its moment, so inertias of bodies that no
+coupled joint moves are not in them. All other rows combine joints only.
 """
 
 from __future__ import annotations
@@ -84,10 +84,10 @@ class RowColumns:
 
 @dataclass(frozen=True)
 class LoopRows:
-    """What a loop exerts.
+    """Forces of a closed loop.
 
     `wrenches`, (k, 6): on its first body, at the node's joint frame, without directions that never do work. `joints`:
-    measured ones on which they do, by their place among the coupled joints; `dofs`: by their number.
+    measured joints on which they do work, by index among the coupled joints; `dofs`: by degree of freedom.
     """
 
     geometry: LoopGeometry
@@ -114,11 +114,11 @@ class _LoopGroup:
 
 
 class MotorForces:
-    """Rows of generalized forces as the motors of closed loops feel them.
+    """Generalized forces as the motors of closed loops feel them.
 
-    With the loops' Jacobian J = [J_a, J_p] by motors and passive joints, a motor's motion moves the passive joints by
-    G = -J_p^+ J_a. Of generalized forces f, what goes through the loops drops out of f_a + G^T f_p: the principle of
-    virtual work. `none`: the robot has no loops, and rows stay as they are.
+    With the loops' Jacobian J = [J_a, J_p] for motors and passive joints, a motor moves the passive joints by G =
+    -J_p^+ J_a. In f_a + G^T f_p the loop forces cancel (principle of virtual work). `none`: the robot has no loops, and
+    rows do not change.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -144,7 +144,7 @@ class MotorForces:
         return tuple(dof for group in self._groups for dof in group.passive)
 
     def above(self, dofs: Iterable[int]) -> set[int]:
-        """Degrees of freedom with those of all loops that some of them are in, but for passive joints in these."""
+        """Degrees of freedom, extended by those of all loops they are in, without passive joints of these loops."""
         given = set(dofs)
         out = set(dofs)
         for group in self._groups:
@@ -153,9 +153,9 @@ class MotorForces:
         return out
 
     def of(self, tree: KinematicTree, states: BodyStates, forces: Tensor) -> Tensor:
-        """Generalized forces (..., B, n_rows) with those of motors in loops; NaN at passive joints in them.
+        """Generalized forces (..., B, n_rows) with those of motors in loops; NaN at passive joints in loops.
 
-        Also NaN where motors do not determine how the passive joints move.
+        Also NaN where motors do not determine the motion of the passive joints.
 
         Args:
             tree: the robot's constants.
@@ -245,11 +245,11 @@ class RowBlock:
 
 
 class RowBlocks:
-    """The blocks of a contact state's coupled rows.
+    """Blocks of a contact state's coupled rows.
 
-    `order`: of the degrees of freedom (base rows, then coupled joints), for a W that is triangular: joints from the
-    leaves to the base, then the base's force, then its moment. `has_triangular_base`: whether another W is
-    to be triangular in the base rows (see `torchid.problem.null_bases.triangularize_base_rows`).
+    `order`: of the degrees of freedom (base rows, then coupled joints) for a triangular W: joints from the leaves to
+    the base, then the base's force, then its moment. `has_triangular_base`: whether another W is made triangular in the
+    base rows (see `torchid.problem.null_bases.triangularize_base_rows`).
     """
 
     def __init__(
@@ -260,14 +260,14 @@ class RowBlocks:
         loop_forces: int,
         extras: Sequence[tuple[int, Sequence[int], bool]],
     ) -> None:
-        """Work out what combines with what.
+        """Find out which degrees of freedom the rows combine.
 
         Args:
             columns: of the rows.
             coupled: numbers of the coupled joints.
             bodies: in contact.
-            loop_forces: number of forces that closed loops exert.
-            extras: extra parameters: column, coupled joints that it depends on, whether it depends on the base.
+            loop_forces: number of forces of closed loops.
+            extras: extra parameters: column, coupled joints it depends on, whether it depends on the base.
         """
         self._columns = columns
         self._extras = extras
@@ -338,10 +338,10 @@ def row_block(
     extras: tuple[int, ...] = (),
     held: Sequence[int] = (),
 ) -> RowBlock:
-    """A block of rows.
+    """Make a block of rows.
 
-    What W combines moves no node that the ground holds: `A_x W = 0` says so. Their path sums are zero, and with them
-    the columns of all nodes that move with one.
+    The combinations in W do not move a node that the ground holds (`A_x W = 0`). The path sums of such nodes are zero,
+    and so are the columns of all nodes that move with one.
 
     Args:
         columns: of all rows.
@@ -349,7 +349,7 @@ def row_block(
         moved: nodes that the joints move, ascending: node, joint, ratio of its motion.
         base: base rows that are combined: "all", "force" or "none".
         extras: columns of extra parameters.
-        held: nodes that the ground holds, each by six unmeasured components of a wrench.
+        held: nodes that the ground holds, by six unmeasured wrench components.
     """
     tree = columns.tree
     layout = columns.layout
@@ -412,10 +412,10 @@ class ContactBody:
 
     Attributes:
         body: its node.
-        unmeasured: contacts with unmeasured components, and these.
-        span: (k, 6), wrenches at the node's joint frame that span the unmeasured ones of every sample; None where these
+        unmeasured: contacts with unmeasured components, and these components.
+        span: (k, 6), wrenches at the node's joint frame that span the unmeasured ones of every sample; None if they
             change with the ground's normal.
-        count: dimension of their space at almost every sample; more wrenches are reduced to a basis at each.
+        count: dimension of their space at almost every sample; more wrenches are reduced to a basis for each sample.
         measured: contact and component of each measured row.
         joints: indices, among the coupled joints, of those that move the body.
     """
@@ -429,20 +429,20 @@ class ContactBody:
 
     @property
     def is_held(self) -> bool:
-        """Whether all six components of a wrench on it are unmeasured, so that no combination of rows moves it."""
+        """Whether all six wrench components are unmeasured, so that no combination of rows moves the body."""
         return self.span is not None and len(self.span) == _WRENCH
 
 
 @dataclass(frozen=True)
 class ContactStateLayout:
-    """The bodies, joints and columns of a contact state's rows, which are the same for all its samples.
+    """Bodies, joints and columns of a contact state's rows; they are the same for all its samples.
 
     Measured joints between the base and a contact, or in a closed loop, are coupled: the projection combines their rows
     with those of the base. All others are uncoupled: each is an equation of its own.
 
     Attributes:
         contact_bodies: bodies in contact.
-        loops: what closed loops exert, which is never measured.
+        loops: forces of closed loops, which are never measured.
         coupled_joints: indices of independent joints.
         uncoupled_joints: indices of independent joints, with the block of each one's row.
         row_std: noise of the base rows and coupled joints [N, N m].

@@ -102,13 +102,13 @@ class Assembly:
 
 @one_thread()
 def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:
-    """Pose the linear problem in all 12 L parameters of the bodies from a factor that `compress` made.
+    """Build the linear problem in all 12 L parameters of the bodies from a factor made by `compress`.
 
     Raises:
         ValueError: the builder has extra parameters; `assemble` eliminates them.
     """
     if builder.extras:
-        raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
+        raise ValueError("builder: found one with extra parameters; accepted: a builder without, or torchid.assemble")
     corrected = corrected_triangle(factor, column_prior(builder, robot, friction))
     return problem_from_triangle(
         corrected.R, factor.rows, factor.oversampling, builder, robot, friction, corrected.shrinkage
@@ -123,17 +123,17 @@ def assemble(
     friction: bool = True,
     reading_noise: Mapping[int, float] | None = None,
 ) -> Assembly:
-    """Pose the linear problem in the bodies' parameters (12 L,), with all extra parameters eliminated.
+    """Build the linear problem in the bodies' parameters (12 L,), with all extra parameters eliminated.
 
     Orthogonal projection eliminates first the unknowns of each log, then those of all logs. It changes neither the
     least-squares solution nor the noise of the rows.
 
     Args:
         parts: factors of logs, from `compress_parts` or `compress_in_blocks`.
-        builder: of their rows, with their extra parameters.
+        builder: that made the rows, with its extra parameters.
         robot: with the nominal parameters.
         friction: whether friction is free.
-        reading_noise: as `Assembly` has it; None to leave it in the rows.
+        reading_noise: as in `Assembly`; None to leave this noise in the rows.
     """
     everything = merge_factors((part.factor for part in parts), builder)
     reading_noise = reading_noise or dict.fromkeys(scale_columns(builder), 0.0)
@@ -246,10 +246,7 @@ def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
 
 
 def _bounded_terms(of_all: Elimination, robot: Robot) -> EliminatedTerms | None:
-    """The unknowns of all logs, with the rows they have been eliminated by; None if no condition is on any.
-
-    No term that is `nonnegative` is, nor is dry friction in either direction where the two differ.
-    """
+    """Unknowns of all logs with physical bounds (`nonnegative` terms, dry friction by direction); None without any."""
     conditions: list[SignCondition] = []
     extras = of_all.extras
     for number, extra in enumerate(extras):

@@ -1,4 +1,4 @@
-"""What sensors and actuators add: parameters beside those of bodies, their columns, and groups of equal noise."""
+"""Extra parameters of sensors and actuators, their columns, and groups of sensors with equal noise."""
 
 from __future__ import annotations
 
@@ -36,22 +36,23 @@ _SCALE_SIZE = 0.1
 
 @dataclass(frozen=True)
 class ExtraTerms:
-    """Which extra parameters are fitted; none by default.
+    """Extra parameters that a fit estimates besides the bodies' parameters; none by default.
 
-    A reading y of a sensor with an offset o and a scale s means the force s y - o. `offsets` and `scales` say for
-    some of `CHANNELS` whether they are constant over a "log" or over "all" logs. `scales` may have groups of sensors
-    instead: all in a group have one scale, constant over all logs, and those in none have a scale of 1.
-
-    Of every joint whose torque is measured: `armature` (reflected rotor inertia, times the joint's acceleration),
-    `torque_offset`, `asymmetric_coulomb`, half the difference of Coulomb friction forwards and backwards, and
-    `stiffness` of a spring, or of cables and hoses that act as one, times the joint's position; where it is at rest
-    follows with an offset of the torque.
-    `sign_width` [rad/s or m/s] replaces the sign of a velocity v in dry friction by tanh(v / width).
-    `stribeck`, a velocity v_s [rad/s or m/s]: what friction at rest is beyond Coulomb friction, which goes with
-    sign(v) exp(-(v / v_s)^2) (Armstrong-Hélouvry, Dupont and Canudas de Wit, "A survey of models, analysis tools and
-    compensation methods for the control of machines with friction", 1994, with an exponent of 2).
-
-    `slope`: one further unknown of a search, see `torchid.fitting.profile`; its column is the `slope` of the samples.
+    Attributes:
+        offsets: channels of `CHANNELS` with an unknown offset o: "log" for one value per log, "all" for one value. A
+            reading y means the force s y - o.
+        scales: the same for unknown scales s. Instead of "log" or "all", groups of sensors: each group has one scale
+            for all logs, other sensors have scale 1.
+        armature: whether to fit the reflected rotor inertia of every joint with a measured torque.
+        torque_offset: whether to fit a constant torque of these joints.
+        asymmetric_coulomb: whether to fit half the difference between forward and backward Coulomb friction.
+        stribeck: Stribeck velocity v_s [rad/s or m/s]. Fits the static friction beyond Coulomb friction, which acts as
+            sign(v) exp(-(v / v_s)^2). Source: Armstrong-Hélouvry, Dupont, Canudas de Wit, "A survey of models, analysis
+            tools and compensation methods for the control of machines with friction", 1994, with exponent 2.
+        stiffness: whether to fit a joint spring (also cables and hoses). Its rest position follows from
+            `torque_offset`.
+        sign_width: replaces the sign of a velocity v in dry friction by tanh(v / sign_width) [rad/s or m/s].
+        slope: adds the unknown of a search, see `torchid.fitting.profile`; its column is `Samples.slope`.
     """
 
     offsets: Mapping[str, str] = field(default_factory=dict)
@@ -69,15 +70,15 @@ class ExtraTerms:
 
 @dataclass(frozen=True)
 class ActuatorTerm:
-    """An extra parameter of every joint whose torque is measured: it adds value times column to the torque.
+    """An extra parameter of every joint with a measured torque: it adds value times column to the torque.
 
     Attributes:
-        unit: of the parameter at a hinge.
-        size: of a plausible value, in this unit.
-        words: what labels call it.
-        column: (B,) of samples, at a joint's index.
-        nonnegative: whether physics keeps it from being negative.
-        needs_motor: whether joints without a motor have none.
+        unit: of the parameter of a revolute joint.
+        size: a plausible value.
+        words: name in labels.
+        column: (B,), of samples at a joint index.
+        nonnegative: whether it is physically non-negative.
+        needs_motor: whether joints without a motor do not have it.
     """
 
     unit: str
@@ -120,14 +121,14 @@ class Extra:
     """One extra parameter.
 
     Attributes:
-        what: "offset", "scale" (less 1), one of `ACTUATORS`, or `SLOPE`.
-        name: of the joint or the sensor's frame, or the patterns of a group; `component`: of its wrench, "" of a joint
-            torque, "force" or "moment" for a group of sensors.
-        unit: of the unknown.
-        size: of a plausible value, in this unit.
-        per_log: whether every log has its own.
-        dofs: indices in the robot's `dof_names`, more than one of a group, or
-        contacts: index among the contacts, and component along the axes that the log has the wrench in.
+        what: "offset", "scale" (minus 1), one of `ACTUATORS`, or `SLOPE`.
+        name: of the joint or sensor frame, or the patterns of a group.
+        component: of the wrench, "" for a joint torque, "force" or "moment" for a group of sensors.
+        unit: of the parameter.
+        size: a plausible value.
+        per_log: whether every log has its own value.
+        dofs: indices in the robot's `dof_names`; several for a group.
+        contacts: or contact index and component, along the axes of the log's wrench.
     """
 
     what: str
@@ -141,37 +142,37 @@ class Extra:
 
     @property
     def dof(self) -> int | None:
-        """The first of `dofs`, the only one of all but groups."""
+        """The first of `dofs` (groups have several), or None."""
         return self.dofs[0] if self.dofs else None
 
     @property
     def contact(self) -> tuple[int, int] | None:
-        """The first of `contacts`, the only one of all but groups."""
+        """The first of `contacts` (groups have several), or None."""
         return self.contacts[0] if self.contacts else None
 
     @property
     def nonnegative(self) -> bool:
-        """Whether physics keeps it from being negative."""
+        """Whether it is physically non-negative."""
         return self.what in ACTUATORS and ACTUATORS[self.what].nonnegative
 
     @property
     def label(self) -> str:
-        """A unique name: "offset of l_sole fz", "offset of limb sensor l_ankle fz", "scale of *_hip,*_knee"."""
+        """Unique name, such as "offset of l_sole fz", "offset of limb sensor l_ankle fz" or "scale of *_hip,*_knee"."""
         limb = "limb sensor " if self.component and self.dofs else ""  # a link may have its joint's name
         channel = f"{limb}{self.name} {self.component}".strip()
         return f"{in_words(self.what)} of {channel}"
 
 
 def in_words(what: str) -> str:
-    """A kind of extra parameters as labels have it: "asymmetric Coulomb friction"."""
+    """Plain name of a kind of extra parameter, such as "asymmetric Coulomb friction"."""
     return ACTUATORS[what].words if what in ACTUATORS else what
 
 
 def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms) -> tuple[Extra, ...]:
-    """All extra parameters of a robot with its sensors, those of sensors first.
+    """All extra parameters of a robot with its sensors; those of sensors come first.
 
-    Where a log has wrenches along world axes, an offset is constant along these, so that every axis has one as soon as
-    one component of the vector is measured.
+    With wrenches along world axes, offsets are constant along these. All three axes then have an offset if one
+    component of the vector is measured.
     """
     extras: list[Extra] = []
     channels = list(_channels(robot, contacts, sensors))
@@ -207,7 +208,7 @@ def _group_scales(kind: str, groups: ScaleGroups, channels: Sequence[Channel]) -
 
 
 def measured_channels(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> dict[str, tuple[str, ...]]:
-    """Those of `CHANNELS` that a sensor set measures, with the names of the joints or frames of each."""
+    """Measured kinds of `CHANNELS`, with the names of their joints or frames."""
     channels = list(_channels(robot, contacts, sensors))
     names = {kind: tuple(dict.fromkeys(x.name for x in channels if x.kind == kind)) for kind in CHANNELS}
     return {kind: named for kind, named in names.items() if named}
@@ -264,7 +265,7 @@ class NoiseGroups:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All groups, in the order that results have them in."""
+        """All groups, in the order of results."""
         of_joints = [f"{_JOINTS}.{name}" for name in self.joints]
         return (*of_joints, "contact_force", "contact_moment", *BASE_GROUPS, "ft_force", "ft_moment")
 
@@ -274,19 +275,19 @@ class NoiseGroups:
         return self.joints[name] if key == _JOINTS else "N" if "force" in key else "N m"
 
     def alike(self, groups: Sequence[str]) -> list[np.ndarray]:
-        """Indices of groups whose noise may be of one size, (k,) each: joints whose forces have one unit."""
+        """Indices of groups whose noise may have the same size, (k,) each: joints with the same unit."""
         units = [self.unit(group) if noise_key(group) == _JOINTS else "" for group in groups]
         return [np.flatnonzero(np.array(units) == unit) for unit in ("N m", "N") if unit in units]
 
     def sources(self, contacts: Sequence[Contact], sensors: SensorSet, base_rows: int) -> list[str]:
-        """The group of every source of noise: base rows, what is measured of `dof_names`, components of contacts."""
+        """Group of every noise source: base rows, measured `dof_names`, contact components."""
         dofs = [*self.names[: len(self.joints)], *_LIMBS * ((len(sensors.torque) - len(self.joints)) // 6)]
         measured = [dofs[dof] for dof in np.flatnonzero(sensors.torque)]
         components = np.argwhere(measured_components(contacts, sensors))[:, 1]
         return [*BASE_GROUPS[:base_rows], *measured, *(_CONTACTS[k] for k in components)]
 
     def settings(self, fields: Mapping[str, Any]) -> dict[str, Any]:
-        """Fields of `SensorNoise` as `sensors.noise` states them, those of joints by their names."""
+        """Values by field of `SensorNoise`, as `sensors.noise` states them; joints by name."""
         return {key: dict(zip(self.joints, x, strict=True)) if key == _JOINTS else x for key, x in fields.items()}
 
     def values(self, noise: SensorNoise) -> dict[str, float]:
@@ -296,9 +297,9 @@ class NoiseGroups:
         return dict(zip(self.names, [*joints, *sensors, *noise.base_std.tolist(), *noise.limb_std], strict=True))
 
     def noise(self, known: Mapping[str, float], guess: SensorNoise) -> SensorNoise:
-        """Sensor noise from standard deviations by group; others are guessed.
+        """Sensor noise from standard deviations by group; missing groups are guessed.
 
-        A joint of which nothing is known has the geometric mean of those that are known and have its unit.
+        An unknown joint gets the geometric mean of the known joints with the same unit.
         """
         values = {**self.values(guess), **known}
         joints = self.names[: len(self.joints)]
@@ -335,13 +336,13 @@ def contact_extra_column(extra: Extra, samples: Samples, contact: int, axis: int
 
 
 class KnownTorques:
-    """What armatures and springs of an MJCF robot need, `armature * acceleration + stiffness * position + constant`.
+    """Torques of known armatures and springs: `armature * acceleration + stiffness * position + constant`.
 
-    Armatures and stiffnesses that are among the extra parameters are not known: these stand for all of them.
+    They are those of an MJCF file. An armature or stiffness that is an extra parameter replaces the file's value.
     """
 
     def __init__(self, robot: Robot, extras: Sequence[Extra]) -> None:
-        """Of a robot, those that are not `extras`."""
+        """Known values of a robot, without `extras`."""
         fitted = {what: [dof for x in extras if x.what == what for dof in x.dofs] for what in ("armature", "stiffness")}
         self._armature = robot.armature.copy()
         self._stiffness = robot.stiffness.copy()
@@ -351,7 +352,7 @@ class KnownTorques:
         self.none = not np.any([self._armature, self._stiffness, self._constant])
 
     def of(self, samples: Samples) -> Tensor:
-        """Of some samples, (B, n + 6 F) [N m or N], 0 at force/torque sensors."""
+        """Torques of samples, (B, n + 6 F) [N m or N], 0 at force/torque sensors."""
         armature, stiffness, constant = (
             samples.time.new_tensor(x) for x in (self._armature, self._stiffness, self._constant)
         )

@@ -23,12 +23,14 @@ AT_BOUND = 1e-5
 
 @dataclass(frozen=True)
 class SignCondition:
-    """`terms @ psi + parameters @ phi >= 0`: a number that physics keeps from being negative.
+    """Condition that a physical quantity is not negative: `terms @ psi + parameters @ phi >= 0`.
 
     Attributes:
-        name: of the number.
-        terms: (M,); parameters: (P,).
-        size: of a plausible value; unit: of both.
+        name: of the quantity.
+        terms: (M,).
+        parameters: (P,).
+        size: a plausible value.
+        unit: of the quantity.
     """
 
     name: str
@@ -38,21 +40,24 @@ class SignCondition:
     unit: str
 
     def value(self, phi: Array, psi: Array) -> float:
-        """The number at parameters phi, (P,), and terms psi, (M,)."""
+        """The quantity at parameters phi, (P,), and terms psi, (M,)."""
         return float(self.terms @ psi + self.parameters @ phi)
 
 
 @dataclass(frozen=True)
 class EliminatedTerms:
-    """Unknowns psi, (M,), beside the parameters phi of a `LinearProblem`, whose rows they have been eliminated from.
+    """Unknowns psi, (M,), that were eliminated from the rows of a `LinearProblem` but have physical bounds.
 
-    The whole cost is that of the problem plus ||C phi + D psi - z||^2, which is 0 at their best for any phi: whoever
-    does not bound them need not know of them.
+    The total cost is the cost of the problem plus ||C phi + D psi - z||^2. Without bounds this part is 0 at the best
+    psi.
 
     Attributes:
-        C: (r, P); D: (r, M), of rank r; z: (r,); whitened as the rows of the problem.
-        size: (M,), of plausible values; labels: (M,).
-        conditions: on them.
+        C: (r, P), whitened like the rows of the problem.
+        D: (r, M), of rank r.
+        z: (r,).
+        size: (M,), plausible values.
+        labels: (M,).
+        conditions: bounds on psi.
     """
 
     C: Array
@@ -66,25 +71,25 @@ class EliminatedTerms:
 
     @cached_property
     def undetermined(self) -> Array:
-        """Orthonormal combinations that no row depends on, (k, M), in units of the size."""
+        """Orthonormal combinations that no row depends on, (k, M), in units of `size`."""
         _, values, Vt = np.linalg.svd(self.D * self.size, full_matrices=True)
         return np.asarray(Vt[int((values > RANK_TOLERANCE * values.max(initial=0.0)).sum()) :])
 
     def best(self, phi: Array) -> Array:
-        """The terms that fit parameters (P,) best, of least norm, (M,)."""
+        """Terms (M,) that fit parameters (P,) best, with the least norm."""
         scaled = np.linalg.lstsq(self.D * self.size, self.z - self.C @ phi, rcond=RANK_TOLERANCE)[0]
         return np.asarray(self.size * scaled)
 
     def misfit(self, phi: Array, psi: Array) -> float:
-        """What terms (M,) add to the cost at parameters (P,)."""
+        """Cost that terms (M,) add at parameters (P,)."""
         return float(np.square(self.C @ phi + self.D @ psi - self.z).sum())
 
     def conditions_at(self, free: np.ndarray, nominal: Array) -> tuple[SignCondition, ...]:
-        """The conditions that some terms meet strictly: not that on a joint whose dry friction is fixed at none.
+        """Conditions that can hold strictly: without those on joints whose dry friction is fixed at 0.
 
         Args:
             free: (P,) bool, parameters that are fitted.
-            nominal: (P,), the values of the others.
+            nominal: (P,), values of the other parameters.
         """
         return tuple(
             condition
@@ -95,7 +100,7 @@ class EliminatedTerms:
         )
 
     def at_bounds(self, phi: Array, psi: Array | None) -> frozenset[str]:
-        """Labels of terms of conditions that hold with equality at phi (P,) and psi (M,); none without psi."""
+        """Labels of terms whose conditions hold with equality at phi (P,) and psi (M,); empty without psi."""
         if psi is None:
             return frozenset()
         standing = [
@@ -111,22 +116,22 @@ _MERGED = 8  # blocks that are factorized at once: half of the work of one after
 
 @dataclass(frozen=True)
 class LinearProblem:
-    """min over phi of ||A phi - b||^2 + residual, rows whitened to unit noise, near a nominal phi.
+    """Linear least-squares problem: min over phi of ||A phi - b||^2 + residual, with rows whitened to unit noise.
 
     Attributes:
-        A: (R, P) with R at most the number of independent columns; b: (R,).
-        residual: squared norm of the part of the right-hand side that no phi can explain.
-        rows: number of scalar equations that went in.
-        nominal: (P,), the prior parameters.
-        scale: (P,), > 0, the size a deviation of each parameter is measured in.
-        free: (P,) bool, parameters to fit; the others stay nominal.
-        oversampling: rows per independent row, at least 1: a low-pass filter leaves noise correlated, so that rows hold
-            less information than their number suggests.
-        shrinkage: (R, Q), None without any: what the right-hand side lacks, of rows that are mostly noise of the
-            motion, for independent deviations of unit variance from the nominal parameters. The first P are of the
-            parameters, by `PRIOR_DEVIATION` of their scale: A (phi - nominal) - shrinkage @ deviations is what to
-            expect of b - A nominal.
-        terms: unknowns beside the parameters that physics bounds, None without any.
+        A: (R, P), R at most the number of independent columns.
+        b: (R,).
+        residual: squared norm of the part of the right-hand side that no phi explains.
+        rows: number of scalar equations before compression.
+        nominal: (P,), prior mean of the parameters.
+        scale: (P,), > 0, unit in which deviations of each parameter are measured.
+        free: (P,) bool, parameters to fit; the others keep their nominal values.
+        oversampling: rows per independent row, at least 1. A low-pass filter correlates noise, so the rows carry less
+            information than their number suggests.
+        shrinkage: (R, Q), or None. Correction of rows with much motion noise: b - A nominal has the expectation A (phi
+            - nominal) - shrinkage @ deviations, for deviations with unit variance. The first P deviations are those of
+            the parameters, in units of `PRIOR_DEVIATION` times `scale`.
+        terms: further unknowns with physical bounds, or None.
     """
 
     A: Array
@@ -144,26 +149,24 @@ class LinearProblem:
     __repr__ = short_repr
 
     def _headline(self) -> str:
-        return f"{self.rows} whitened equations for {self.A.shape[1]} parameters, {int(self.free.sum())} of them free"
+        return f"{self.rows} whitened equations for {self.A.shape[1]} parameters ({int(self.free.sum())} free)"
 
     def __post_init__(self) -> None:
         """Check types and shapes, and that all numbers are finite."""
         for name, kind in (("A", "f"), ("b", "f"), ("nominal", "f"), ("scale", "f"), ("free", "b")):
             if not isinstance(x := getattr(self, name), np.ndarray) or x.dtype.kind != kind:
-                reason = f"{type(x).__name__} of {getattr(x, 'dtype', 'no dtype')}"
+                reason = f"{type(x).__name__} (dtype {getattr(x, 'dtype', None)})"
                 raise TypeError(
                     f"{name}: found {reason}; accepted: a NumPy array of {'bool' if kind == 'b' else 'floats'}"
                 )
         rows, columns = self.A.shape
         shapes = (self.b.shape, self.nominal.shape, self.scale.shape, self.free.shape)
         if shapes != ((rows,), (columns,), (columns,), (columns,)):
-            raise ValueError(
-                f"b, nominal, scale, free: found shapes {shapes}; accepted: {rows} rows, {columns} columns"
-            )
+            accepted = f"({rows},), then ({columns},) three times, for A of shape ({rows}, {columns})"
+            raise ValueError(f"b, nominal, scale, free: found shapes {shapes}; accepted: {accepted}")
         if self.shrinkage is not None and (len(self.shrinkage) != rows or self.shrinkage.shape[1] < columns):
-            raise ValueError(
-                f"shrinkage: found shape {self.shrinkage.shape}; accepted: {rows} rows, at least {columns} columns"
-            )
+            accepted = f"({rows}, Q), Q at least {columns}"
+            raise ValueError(f"shrinkage: found shape {self.shrinkage.shape}; accepted: {accepted}")
         for name in ("A", "b", "residual", "nominal", "scale"):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name}: found a number that is not finite; accepted: finite numbers")
@@ -173,12 +176,12 @@ class LinearProblem:
             raise ValueError(f"oversampling: found {self.oversampling}; accepted: a finite number of at least 1")
 
     def require_bodies(self) -> None:
-        """Raise ValueError unless the columns may be those of bodies."""
+        """Raise ValueError if the number of columns is not a multiple of 12."""
         if len(self.free) % parameters.PER_BODY:
-            raise ValueError(f"A: found {len(self.free)} columns; accepted: {parameters.PER_BODY} for each body")
+            raise ValueError(f"A: found {len(self.free)} columns; accepted: {parameters.PER_BODY} per body")
 
     def free_bodies(self) -> np.ndarray:
-        """Bodies whose inertial parameters are free, (L',) int, where the parameters are those of bodies.
+        """Indices of bodies with free inertial parameters, (L',) int.
 
         Raises:
             ValueError: the columns are not those of bodies, or a body has both free and fixed inertial parameters.
@@ -186,24 +189,25 @@ class LinearProblem:
         self.require_bodies()
         inertial = self.free.reshape(-1, parameters.PER_BODY)[:, parameters.INERTIAL]
         if (inertial.any(axis=1) != inertial.all(axis=1)).any():
-            raise ValueError("free: found a body of which part is free; accepted: inertial parameters body by body")
+            reason = "a body with both free and fixed inertial parameters"
+            raise ValueError(f"free: found {reason}; accepted: all ten of a body free, or none")
         return np.flatnonzero(inertial.all(axis=1))
 
     def cost(self, phi: Array, psi: Array | None = None) -> float:
-        """Sum of squared whitened residuals over all rows at parameters `phi`, (P,).
+        """Sum of squared whitened residuals of all rows at parameters `phi`, (P,).
 
-        `psi`: (M,), values of the `terms`; None for those that fit best.
+        `psi`: (M,), values of the `terms`; None for the best fit.
         """
         misfit = self.A @ phi - self.b
         added = 0.0 if psi is None or self.terms is None else self.terms.misfit(phi, psi)
         return float(misfit @ misfit + self.residual + added)
 
     def shared(self, key: Hashable, compute: Callable[[], T]) -> T:
-        """What solves of the same problem with other settings have in common, computed once.
+        """Return a cached value that several solves of this problem share.
 
         Args:
-            key: names what is computed and every setting it depends on.
-            compute: called if nothing is stored under the key.
+            key: names the value and every setting it depends on.
+            compute: called if the cache has no value under this key.
         """
         if key not in self._shared:
             self._shared[key] = compute()
@@ -211,11 +215,11 @@ class LinearProblem:
 
     @property
     def parameter_shrinkage(self) -> Array | None:
-        """The part of `shrinkage` by deviations of the free parameters, (R, P'), in units of their scale."""
+        """Columns of `shrinkage` for the free parameters, (R, P'), in units of their scale."""
         return None if self.shrinkage is None else self.shrinkage[:, : len(self.free)][:, self.free] / PRIOR_DEVIATION
 
     def prediction_distance(self, phi: Array, other: Array) -> float:
-        """Rms difference of the projected whitened forces that two parameter vectors, (P,), predict."""
+        """Rms difference between the whitened projected forces that two parameter vectors, (P,), predict."""
         difference = self.A @ (phi - other)
         return float(np.sqrt(difference @ difference / max(self.rows, 1)))
 
@@ -256,18 +260,19 @@ _TENSORS = ("blocks", "noise_gram")
 
 @dataclass(repr=False, eq=False)
 class TriangularFactor:
-    """R with `R^T R = X^T X` for all rows X added so far, right-hand side as the last column.
+    """Compressed rows: R with `R^T R = X^T X` for all rows X added so far; the last column is the right-hand side.
 
-    Rows that are zero outside a few columns are factorized in a block with just these columns. Memory grows with the
-    square of the columns, not with the rows. Householder factorizations keep the full accuracy of the rows (a Gram
-    matrix would square the condition number). Factors of parts of the data merge into the factor of all of it.
+    Rows that are zero outside a few columns are factorized in a block with these columns only. Memory grows with the
+    square of the number of columns, not with the number of rows. Householder factorizations keep the full accuracy (a
+    Gram matrix would square the condition number). Factors of parts of the data can be merged.
 
     Attributes:
-        columns: of the rows, without the right-hand side.
-        rows, independent_rows: that were added.
-        blocks: rows (M, len(support) + 1) that stand for all that were added with the same columns, by these columns.
-        noise_gram: what noise of the motion adds to X^T X on average, by the columns of the rows that have it,
-            (len(support) + 1, len(support) + 1); an estimate, see `torchid.problem.noise_gram`.
+        columns: number of columns without the right-hand side.
+        rows: number of added rows.
+        independent_rows: the same, divided by their oversampling.
+        blocks: compressed rows (M, len(support) + 1) by their non-zero columns (`support`).
+        noise_gram: expected contribution of motion noise to X^T X, (len(support) + 1, len(support) + 1) by columns; an
+            estimate, see `torchid.problem.noise_gram`.
     """
 
     columns: int
@@ -279,27 +284,27 @@ class TriangularFactor:
     __repr__ = short_repr
 
     def _headline(self) -> str:
-        return f"of {self.rows} whitened rows, {self.columns} columns and the right-hand side"
+        return f"{self.rows} whitened rows, {self.columns} columns and the right-hand side"
 
     def __getstate__(self) -> dict[str, object]:
-        """What another process gets: arrays, as it may have another device."""
+        """State to send to another process: NumPy arrays, because the process may use another device."""
         return vars(self) | {name: {at: x.cpu().numpy() for at, x in vars(self)[name].items()} for name in _TENSORS}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take over what another process sent."""
+        """Restore the state that another process sent."""
         tensors = {name: {at: torch.from_numpy(x) for at, x in state[name].items()} for name in _TENSORS}
         vars(self).update(state | tensors)
 
     @property
     def oversampling(self) -> float:
-        """Rows per independent row, 1 without any."""
+        """Rows per independent row; 1 for an empty factor."""
         return max(1.0, self.rows / self.independent_rows) if self.rows else 1.0
 
     def add(self, support: tuple[int, ...], rows: Tensor, oversampling: float = 1.0) -> None:
         """Add rows.
 
         Args:
-            support: the columns in which they are not zero.
+            support: columns in which the rows are not zero.
             rows: (M, len(support) + 1), right-hand side last.
             oversampling: rows per independent row, at least 1.
         """
@@ -307,10 +312,10 @@ class TriangularFactor:
         self.absorb(support, rows)
 
     def add_in_place(self, support: tuple[int, ...], stacked: Tensor, oversampling: float = 1.0) -> None:
-        """Add rows that have room above them, which are overwritten.
+        """Add rows in a buffer with free space above them; the buffer is overwritten.
 
         Args:
-            support: the columns in which they are not zero.
+            support: columns in which the rows are not zero.
             stacked: (len(support) + 1 + M, len(support) + 1), columns contiguous; the rows are the last M.
             oversampling: rows per independent row, at least 1.
         """
@@ -331,12 +336,12 @@ class TriangularFactor:
         """Add the rows of other factors.
 
         Raises:
-            ValueError: the factors differ in columns.
+            ValueError: the factors have different numbers of columns.
         """
         blocks: dict[tuple[int, ...], list[Tensor]] = {}
         for other in others:
             if other.columns != self.columns:
-                raise ValueError(f"merge: found a factor of {other.columns} columns; accepted: {self.columns} columns")
+                raise ValueError(f"merge: found {other.columns} columns; accepted: {self.columns} columns")
             self.rows += other.rows
             self.independent_rows += other.independent_rows
             for support, block in other.blocks.items():
@@ -349,7 +354,7 @@ class TriangularFactor:
                 self.absorb(support, torch.cat(added[start : start + _MERGED]))
 
     def add_noise_gram(self, noise_gram: Mapping[tuple[int, ...], Tensor], weight: float = 1.0) -> None:
-        """Add to the noise Gram matrix, by columns, times the weight of rows."""
+        """Add to the noise Gram matrix, by columns, times a weight."""
         for support, x in noise_gram.items():
             before = self.noise_gram.get(support)
             self.noise_gram[support] = weight * x if before is None else before + weight * x
@@ -361,13 +366,13 @@ class TriangularFactor:
         return replace(self, blocks=blocks, noise_gram=noise_gram)
 
     def to_cpu(self) -> TriangularFactor:
-        """The factor on the CPU, in float64: a CPU factorizes as few rows as factors have in less time than a GPU."""
+        """The factor on the CPU, in float64. A CPU factorizes such small matrices faster than a GPU."""
         blocks = {support: block.to("cpu", torch.float64) for support, block in self.blocks.items()}
         noise_gram = {support: x.to("cpu", torch.float64) for support, x in self.noise_gram.items()}
         return replace(self, blocks=blocks, noise_gram=noise_gram)
 
     def compact(self) -> TriangularFactor:
-        """The factor on the CPU, as one triangle in all columns if that has fewer numbers than its blocks."""
+        """The factor on the CPU, as one triangle in all columns if this takes less memory than the blocks."""
         sizes = ((len(block), block.shape[1]) for block in self.blocks.values())
         numbers = sum(rows * width - (rows * (rows - 1) // 2 if rows == width else 0) for rows, width in sizes)
         if numbers <= (self.columns + 1) * (self.columns + 2) // 2:
@@ -391,14 +396,14 @@ class TriangularFactor:
         return triangularize(torch.cat([rows.T for rows in scattered], dim=1).T)
 
     def noise_gram_of(self, reading_noise: Mapping[int, float]) -> Mapping[tuple[int, ...], Tensor]:
-        """The noise Gram matrix with noise of readings, which have a column alone, times numbers by column."""
+        """Noise Gram matrix with the noise of readings with unknown scale, given as numbers by column."""
         sizes = {
             support: reading_noise.get(support[0], 1.0) if len(support) == 1 else 1.0 for support in self.noise_gram
         }
         return {support: sizes[support] * x for support, x in self.noise_gram.items() if sizes[support]}
 
     def whole_noise_gram(self, reading_noise: Mapping[int, float] = MappingProxyType({})) -> Tensor:
-        """What noise adds to X^T X, (columns + 1, columns + 1), float64 on the CPU; `noise_gram_of` these numbers."""
+        """As `noise_gram_of`, in all columns: (columns + 1, columns + 1), float64 on the CPU."""
         total = torch.zeros(self.columns + 1, self.columns + 1, dtype=torch.float64)
         for support, x in self.noise_gram_of(reading_noise).items():
             at = torch.tensor([*support, self.columns])
@@ -406,7 +411,7 @@ class TriangularFactor:
         return total
 
     def count(self, rows: int, oversampling: float = 1.0) -> None:
-        """Count rows that `absorb` is given something for; a negative number takes rows of zeros back."""
+        """Count rows that are passed to `absorb`; a negative number removes rows of zeros from the count."""
         self.rows += rows
         self.independent_rows = self.independent_rows + rows / oversampling if self.rows else 0.0
 

@@ -1,4 +1,4 @@
-"""A log's joints as the robot has them: torques in its order, passive and welded joints, and those that loops close."""
+"""A log's joints in the robot's order: torques, passive and welded joints, and joints that loops determine."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ _NO_TORQUE = 1e-9  # N m or N: what a simulator's log may have of a joint withou
 
 
 def joint_order(log: Log, robot: Robot) -> list[int]:
-    """Columns of a log's joints in the robot's order; InputError unless it has them all and else welded ones only."""
+    """Columns of a log's joints in the robot's order; InputError if a joint is missing or unknown."""
     known = {body.joint.name for body in robot.bodies if body.joint is not None} | robot.welded.keys()
     for name in log.joint_names:
         if name not in known:
             raise UnknownNameError(log.source, "joint_names", name, robot.joint_names)
     lacking = [name for name in robot.joint_names if name not in log.joint_names]
     if lacking:
-        reason = f"{join_names(lacking, _LISTED)} of {robot.path.name} missing"
+        reason = f"missing joints of {robot.path.name}: {join_names(lacking, _LISTED)}"
         listed = ", ".join(lacking) if len(lacking) <= _LISTED else f"{lacking[0]}, ..."
-        accepted = f"every joint that moves, or robot.weld: [{listed}] for those that are held"
-        accepted += "; joints of loops follow from others that determine them" if robot.loops else ""
+        accepted = f"all moving joints, or robot.weld: [{listed}] for joints that do not move"
+        accepted += "; a joint of a loop may be missing if the others determine it" if robot.loops else ""
         raise LogError(log.source, "joint_names", reason, accepted)
     return [log.joint_names.index(name) for name in robot.joint_names]
 
 
 def recorded_torques(log: Log, robot: Robot, order: list[int]) -> Tensor | None:
-    """Joint torques and wrenches in limbs, (N, n + 6 F); None if neither was recorded nor follows from the robot."""
+    """Joint torques and limb sensor wrenches, (N, n + 6 F); None if there are neither."""
     if log.joint_torque is None and not (robot.ft_names and log.ft_wrench is not None) and not robot.passive:
         return None
     not_recorded = np.full((len(log), robot.n), np.nan)
@@ -56,31 +56,31 @@ def recorded_torques(log: Log, robot: Robot, order: list[int]) -> Tensor | None:
 
 
 def _with_passive(torque: FloatArray, log: Log, robot: Robot) -> FloatArray:
-    """Joint torques (N, n) with zeros for joints without a motor; LogError if one of these was recorded as another."""
+    """Joint torques (N, n) with zeros for joints without a motor; LogError if one was recorded with a torque."""
     passive = robot.is_passive[: robot.n]
     size = np.nanmax(np.abs(torque), axis=0, initial=0.0, where=np.isfinite(torque))
     driven = passive & (size > _NO_TORQUE)
     if driven.any():
         names = [robot.joint_names[joint] for joint in np.flatnonzero(driven)]
-        reason = f"{join_names(names, _LISTED)}: up to {size[driven].max():.3g} N m, without a motor"
+        reason = f"up to {size[driven].max():.3g} N m at joints without a motor: {join_names(names, _LISTED)}"
         others = ", ".join(name for name in robot.passive if name not in names)
-        raise LogError(log.source, "joint_torque", reason, f"0, NaN or none, or robot.passive: [{others}]")
+        raise LogError(log.source, "joint_torque", reason, f"0 or NaN there, or robot.passive: [{others}]")
     return np.where(passive, 0.0, torque)
 
 
 def require_limb_sensors(log: Log, robot: Robot, required: SensorSet) -> None:
-    """Refuse a log without the required force/torque sensors in limbs."""
+    """Raise LogError if the log lacks a required limb force/torque sensor."""
     needed = required.torque[robot.n :].reshape(-1, 6)
     names = [name for name, axes in zip(robot.ft_names, needed, strict=True) if axes.any()]
     if names and log.ft_wrench is None:
-        raise LogError(log.source, "ft_wrench", "missing", "the field, or sensors without ft_sensors")
+        raise LogError(log.source, "ft_wrench", "missing", "the field, or no sensors.ft_sensors")
     if missing := [name for name in names if name not in log.ft_names]:
-        accepted = f"every name in sensors.ft_sensors; the log has {', '.join(log.ft_names)}"
-        raise LogError(log.source, "ft_names", f"{', '.join(missing)} missing", accepted)
+        accepted = f"in sensors.ft_sensors only names that the log has: {', '.join(log.ft_names)}"
+        raise LogError(log.source, "ft_names", f"missing sensors: {', '.join(missing)}", accepted)
 
 
 def columns_in_order(x: np.ndarray, order: list[int]) -> np.ndarray:
-    """Columns (N, n) of an array (N, columns), without a copy where they are all of them in order."""
+    """Columns (N, n) of an array (N, columns); no copy if the order does not change."""
     return x if order == list(range(x.shape[1])) else x[:, order]
 
 
@@ -89,7 +89,7 @@ _TOLERANCE_OF_OTHERS = (0.05, "rad")
 
 
 def without_welded_joints(log: Log, robot: Robot | None) -> Log:
-    """The log without columns for welded joints. Warns TorchidWarning: a joint that is not where it is welded."""
+    """Remove the columns of welded joints. Warns TorchidWarning if a joint is not at its welded position."""
     if robot is None or robot.welded.keys().isdisjoint(log.joint_names):
         return log
     kept = [column for column, name in enumerate(log.joint_names) if name not in robot.welded]
@@ -101,25 +101,25 @@ def without_welded_joints(log: Log, robot: Robot | None) -> Log:
 
 
 def _warn_of_moving_welds(log: Log, robot: Robot) -> None:
-    """Warn, once, if joints of a log are not where they are welded."""
+    """Warn, once, if joints of a log are not at their welded positions."""
     held = np.array([robot.welded.get(name, np.nan) for name in log.joint_names])
     distances = np.nan_to_num(np.abs(log.joint_position - held)).max(axis=0, initial=0.0)
     far = []
     for name, distance in zip(log.joint_names, distances, strict=True):
         limit, unit = _TOLERANCE.get(robot.kind_of_welded.get(name, ""), _TOLERANCE_OF_OTHERS)
         if distance > limit:
-            far.append(f"'{name}' is up to {distance:.2g} {unit} away from {robot.welded[name]:g} {unit}")
+            far.append(f"'{name}' is up to {distance:.2g} {unit} away from its welded {robot.welded[name]:g} {unit}")
     if far:
-        text = "; ".join(far)
-        warn(f"{log_title(log.source)}: joint {text}, where robot.weld holds it: welding is an approximation here")
+        warn(f"{log_title(log.source)}: joint {'; '.join(far)}. robot.weld is an approximation here")
 
 
 _CHUNK = 4096  # samples
+_CHECK_LOOP = "check encoder offsets and the loop's frames"
 
 
 @dataclass(frozen=True)
 class LoopGap:
-    """Distance [m] and angle [rad] of a loop's frames over a log, rms and largest; the angle of a point is 0."""
+    """Distance [m] and angle [rad] between a loop's frames over a log, rms and largest; a point loop has angle 0."""
 
     loop: Loop
     rms: float
@@ -129,20 +129,20 @@ class LoopGap:
 
     @property
     def is_open(self) -> bool:
-        """Whether the frames are farther apart than the loop accepts."""
+        """Whether the rms gap exceeds the loop's `max_gap` or `max_angle`."""
         return self.rms > self.loop.max_gap or self.rms_angle > self.loop.max_angle
 
     @property
     def accepted(self) -> str:
-        """Up to which distance they count as together."""
-        bound = f"rms up to {1e3 * self.loop.max_gap:.3g} mm"
+        """The accepted gap, as text."""
+        bound = f"up to {1e3 * self.loop.max_gap:.3g} mm"
         return bound if self.loop.kind != "weld" else f"{bound} and {np.degrees(self.loop.max_angle):.3g} deg"
 
     def __str__(self) -> str:
-        text = f"rms {1e3 * self.rms:.3g} mm, at most {1e3 * self.largest:.3g} mm"
+        text = f"{1e3 * self.rms:.3g} mm rms, {1e3 * self.largest:.3g} mm at most"
         if self.loop.kind != "weld":
             return text
-        return f"{text}; rms {np.degrees(self.rms_angle):.3g} deg, at most {np.degrees(self.largest_angle):.3g} deg"
+        return f"{text}; {np.degrees(self.rms_angle):.3g} deg rms, {np.degrees(self.largest_angle):.3g} deg at most"
 
 
 def loop_gaps(robot: Robot, joint_position: torch.Tensor) -> list[LoopGap]:
@@ -164,20 +164,17 @@ def loop_gaps(robot: Robot, joint_position: torch.Tensor) -> list[LoopGap]:
 
 
 def require_closed_loops(source: str, joint_position: torch.Tensor, robot: Robot) -> None:
-    """Refuse a log in which the frames of a loop are apart.
+    """Raise LogError if the frames of a loop are apart.
 
     Args:
-        source: its file.
+        source: the log's file.
         joint_position: (N, n) [rad or m].
         robot: with its loops.
-
-    Raises:
-        LogError: names the loop, how far it is open and what is accepted.
     """
     for number, gap in enumerate(loop_gaps(robot, joint_position)):
         if gap.is_open:
-            accepted = f"{gap.accepted} (its max_gap, max_angle): frames that coincide, and encoders without an offset"
-            reason = f"{gap.loop.label} apart by {gap}"
+            reason = f"{gap.loop.label} are apart by {gap}"
+            accepted = f"{gap.accepted} rms (the loop's max_gap, max_angle); {_CHECK_LOOP}"
             raise LogError(source, f"{LOOPS_FIELD}[{number}]", reason, accepted)
 
 
@@ -187,13 +184,13 @@ _DETERMINED = 1e-6  # least over largest singular value, of the loops' Jacobian 
 
 
 def with_loop_joints(log: Log, robot: Robot | None) -> Log:
-    """The log with joints of closed loops that it lacks, if the others determine them.
+    """Add joints of closed loops that the log lacks, if the other joints determine them.
 
-    Positions are those that close the loops, on a path from the posture nearest to joint positions of 0; velocities and
-    accelerations, where the log has these, follow by differentiation of the constraints. Torques are NaN.
+    Positions close the loops, on a path from the closed posture nearest to joint positions of 0. Velocities and
+    accelerations, if the log has them, follow from the differentiated constraints. Torques are NaN.
 
     Raises:
-        LogError: joints in question that the loops do not determine, or loops that do not close.
+        LogError: the loops do not determine the missing joints, or do not close.
     """
     if robot is None or not robot.loops:
         return log
@@ -216,7 +213,7 @@ def with_loop_joints(log: Log, robot: Robot | None) -> Log:
 
 @dataclass(frozen=True)
 class _Joints:
-    """Joints of a robot that a log has, and those that follow from these; by the robot's order."""
+    """Known joints of a log, and missing joints that follow from them, in the robot's order."""
 
     log: Log
     robot: Robot
@@ -270,7 +267,7 @@ class _Joints:
         return out
 
     def _is_open(self, q: Tensor) -> Tensor:
-        """In which samples (N,) some loop is farther open than it accepts."""
+        """Samples (N,) in which a loop is open by more than it accepts."""
         pairs = zip(self.closures.gaps(q), self.robot.loops, strict=True)
         each = [(gap > loop.max_gap) | (angle > loop.max_angle) for (gap, angle), loop in pairs]
         return torch.stack(each).any(0)
@@ -292,15 +289,14 @@ class _Joints:
         J = self.closures.jacobian(q)[..., self.missing]
         values = torch.linalg.svdvals(J)
         if J.shape[1] < len(self.missing) or bool((values[:, -1] <= _DETERMINED * values[:, 0]).all()):
-            names = self._names(self.missing)
-            reason = f"{names} of {self.robot.path.name} missing, which its loops do not determine"
-            raise LogError(self.log.source, "joint_names", reason, "more joints of these loops")
+            reason = f"the loops of {self.robot.path.name} do not determine missing joints {self._names(self.missing)}"
+            raise LogError(self.log.source, "joint_names", reason, "more joints of these loops in the log")
 
     def _require_closed(self, q: Tensor) -> None:
         for number, gap in enumerate(loop_gaps(self.robot, q)) if self._is_open(q).any() else ():
             if gap.largest > gap.loop.max_gap or gap.largest_angle > gap.loop.max_angle:
-                reason = f"{gap.loop.label} apart by {gap}, whatever the positions of {self._names(self.missing)}"
-                accepted = f"{gap.accepted} in every sample: frames that coincide, and encoders without an offset"
+                reason = f"{gap.loop.label} are apart by {gap} at every position of {self._names(self.missing)}"
+                accepted = f"{gap.accepted} in every sample; {_CHECK_LOOP}"
                 raise LogError(self.log.source, f"{LOOPS_FIELD}[{number}]", reason, accepted)
 
     def _names(self, joints: Sequence[int]) -> str:

@@ -1,4 +1,4 @@
-"""Measured and predicted generalized forces, and errors of these by group of rows, also beside the nominal model's."""
+"""Measured and predicted generalized forces, and their errors by group of rows, compared with the nominal model."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ _NOISE_SAMPLES = 64  # of a chunk, for the noise of its measured forces
 
 
 def calibrate_readings(samples: Samples, extras: Sequence[Extra], values: Array, tree: KinematicTree) -> Samples:
-    """Samples with calibrated readings, s y - o for an offset o and a scale s of the reading y.
+    """Samples with calibrated readings: s y - o for an offset o and a scale s of the reading y.
 
-    Readings without extra parameters are shared with `samples`; the others are on disk if `samples` are.
+    Readings without extra parameters share the memory of `samples`; the others are on disk if `samples` are.
 
     Args:
         samples: as recorded.
@@ -86,7 +86,7 @@ def _readings(samples: Samples, calibration: Sequence[tuple[Extra, float]], tree
 def predict_forces(builder: RowBuilder, chunk: Chunk, phi: Tensor) -> Tensor:
     """K phi, (M, n_rows, B), for M parameter vectors (M, columns) in the builder's columns, without extras.
 
-    Row by row: no more of K than one of its rows is ever formed. `chunk`: with whole wrenches.
+    K is computed one row at a time. `chunk`: with whole wrenches.
     """
     tree = builder.tree
     columns = builder.columns
@@ -152,16 +152,15 @@ def _contact_forces(builder: RowBuilder, chunk: Chunk, state: ContactState) -> T
 
 
 def reading_variance(builder: RowBuilder, chunk: Chunk, state: ContactState, noise: SensorNoise) -> Tensor:
-    """Variance of S^T tau + J_C^T lambda by the noise of the readings, (B, n_rows) [N^2, (N m)^2].
+    """Variance of S^T tau + J_C^T lambda from the noise of the readings, (B, n_rows) [N^2, (N m)^2].
 
-    A filter leaves a share of it, `noise_left` of the samples. NaN where a reading that enters, or its
-    noise, is not known.
+    The filter keeps the fraction `noise_left` of it. NaN where a reading, or its noise, is unknown.
 
     Args:
         builder: with all recorded sensors.
         chunk: samples of one contact state.
         state: that state.
-        noise: standard deviations of the readings as recorded, NaN where unknown.
+        noise: standard deviations of the recorded readings, NaN where unknown.
     """
     tree = builder.tree
     std = noise.dof_std(tree.n, tree.n_dofs)
@@ -219,7 +218,7 @@ def _pressure_centres(builder: RowBuilder, chunk: Chunk, state: ContactState, wr
 def null_space_components(builder: RowBuilder, state: ContactState, chunk: Chunk, vectors: Tensor) -> Iterator[Tensor]:
     """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
 
-    Joints away from contacts pass unchanged. NaN in place of what joints at rest leave unknown.
+    Joints away from contacts are unchanged. NaN where joints at rest leave the force unknown.
     """
     layout = builder.layout(state)
     base = builder.tree.base_rows
@@ -284,8 +283,8 @@ def noise_series(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> A
 def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
     """Measured (N, n_rows) and predicted (M, N, n_rows) forces of a log in its order, `phi` as for `to_columns`.
 
-    Measured ones, S^T tau + J_C^T lambda [N, N m], are NaN where a force that enters was not measured. Sensors are
-    taken as calibrated: of the extras only those of actuators enter.
+    Measured forces, S^T tau + J_C^T lambda [N, N m], are NaN where a part was not measured. Sensors count as
+    calibrated: only extras of actuators enter.
     """
     columns = builder.to_columns(phi)
     workspace = builder.workspaces.take()
@@ -415,8 +414,8 @@ DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", *LIMB_GROUPS, WH
 """Groups of rows by which parameters are compared with the nominal ones."""
 
 ADVICE = (
-    "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge than "
-    "that of its config.yaml, or record more and other motion"
+    "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge than in "
+    "its config.yaml, or record more varied motion"
 )
 """Advice for parameters that predict worse than the nominal ones."""
 
@@ -532,20 +531,20 @@ def _all_rms(sums: SumsOfSquares, places: Mapping[str, list[int]]) -> dict[str, 
 
 @dataclass(frozen=True, repr=False)
 class Metrics:
-    """Errors of one parameter vector on some logs; None where the logs cannot give a figure.
+    """Prediction errors of one parameter vector on logs; None where the logs do not give a number.
 
     Attributes:
-        rms: by group of `ERROR_GROUPS`, of `LIMB_GROUPS` for a robot with such sensors, and of `PRESSURE` where contact
-            forces are measured and carry a tenth of the weight. That of "joint_torque" is the mean over joints of their
-            rms; the whitened one is in units of the stated noise.
-        relative: over rms of what was measured, by the same groups.
-        part_rms: of the joints and axes of groups, "joint_torque.l_knee", "base_force.x": axes of the base link, or of
-            a sensor's frame, all sensors in limbs together.
-        part_relative: over rms of what was measured, by the same joints and axes.
-        base_force_of_variation: relative to the rms of the measured base force about its mean, which is mostly weight.
-        noise: by group, the rms that the stated noise of the readings leaves after the filter, which no model predicts;
-            None where it is not known.
-        limbs_in_air: whether joint torques are those of limbs in the air alone, as no contact force was measured.
+        rms: by group of `ERROR_GROUPS`, `LIMB_GROUPS` (limb sensors) and `PRESSURE` (where contact forces are measured
+            and carry a tenth of the weight). "joint_torque" is the mean over joints of their rms. The whitened group is
+            in units of the stated noise.
+        relative: the same, divided by the rms of the measurement.
+        part_rms: rms of single joints and axes, such as "joint_torque.l_knee" or "base_force.x" (axes of the base link,
+            or of the sensor frame, all limb sensors together).
+        part_relative: the same, divided by the rms of the measurement.
+        base_force_of_variation: error of the base force divided by the rms of the measured force about its mean (mostly
+            weight).
+        noise: by group, rms of the stated sensor noise after the filter, the noise floor; None where unknown.
+        limbs_in_air: whether joint torques count only for limbs in the air, because no contact force was measured.
     """
 
     rms: dict[str, float | None]
@@ -557,25 +556,25 @@ class Metrics:
     limbs_in_air: bool = False
 
     def rms_of(self, group: str) -> float | None:
-        """Rms error of a group, None where it is not known."""
+        """Rms error of a group; None if unknown."""
         return self.rms.get(group)
 
     def relative_of(self, group: str) -> float | None:
-        """The same, over the rms of what was measured."""
+        """Rms error of a group divided by the rms of the measurement; None if unknown."""
         return self.relative.get(group)
 
     @property
     def by_joint_rms(self) -> dict[str, float | None]:
-        """Rms of the joint torques by name of the joint."""
+        """Rms error of the torque by joint name [N m or N]."""
         return _parts_of(self.part_rms, "joint_torque")
 
     @property
     def by_joint_relative(self) -> dict[str, float | None]:
-        """The same, over the rms of what was measured."""
+        """Rms error of the torque by joint name, divided by the rms of the measurement."""
         return _parts_of(self.part_relative, "joint_torque")
 
     def label(self, group: str) -> str:
-        """Name and unit of such a group, and what it is limited to."""
+        """Name and unit of a group, with its restriction to limbs in the air."""
         limit = f", {IN_AIR} [" if self.limbs_in_air and group == "joint_torque" else " ["
         return _LABELS[group].replace(" [", limit)
 
@@ -590,7 +589,7 @@ class Metrics:
         return f"Metrics: {', '.join(said) or 'none'}"
 
     def as_dict(self) -> dict[str, object]:
-        """As `metrics.json` has it."""
+        """Content of `metrics.json`."""
         out: dict[str, object] = {}
         for suffix, groups, parts in (("", self.rms, self.part_rms), ("_relative", self.relative, self.part_relative)):
             for group in LIMB_GROUPS:
@@ -612,7 +611,7 @@ def _parts_of(parts: Mapping[str, float | None], group: str) -> dict[str, float 
 
 
 class Evaluation:
-    """Evaluates several parameter vectors at once, in one pass over the logs."""
+    """Evaluate several parameter vectors in one pass over logs."""
 
     def __init__(
         self,
@@ -622,9 +621,9 @@ class Evaluation:
         terms: ExtraTerms | None = None,
         noise: SensorNoise | None = None,
     ) -> None:
-        """Set robot, contacts and actuator terms; all recorded sensors of a log are used.
+        """Set robot, contacts and actuator terms. All recorded sensors of a log are used.
 
-        `noise`: standard deviations of readings as recorded, NaN where unknown, to compare errors with.
+        `noise`: standard deviations of the recorded readings, NaN where unknown; errors are compared with them.
         """
         actuators = replace(terms or ExtraTerms(), offsets={}, scales={})
         self.robot = robot
@@ -634,21 +633,18 @@ class Evaluation:
 
     @property
     def least_carried(self) -> float:
-        """Force on the ground from which on it has a centre of pressure [N]."""
+        """Smallest force on the ground that gives a centre of pressure [N]."""
         return _CARRIES * GRAVITY * float(self.robot.nominal[:, MASS].sum())
 
     def metrics(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[Metrics]:
-        """One `Metrics` per row of `phi` (M, 12 L), over all samples of the logs together.
-
-        Without the whitened projected residual, which depends on sensors.
-        """
+        """One `Metrics` per row of `phi` (M, 12 L), over all samples, without the whitened projected residual."""
         measured, *errors = self.force_sums(logs, {log.fold: phi for log in logs} or {0: phi}, progress)
         return [self.summarize(measured, error) for error in errors]
 
     def force_sums(
         self, logs: Sequence[Samples], phi: Mapping[int, Array], progress: ProgressCallback | None = None
     ) -> list[ForceSums]:
-        """Sums of squares of the measured forces, then of the errors of each row of `phi` (M, 12 L) of a log's fold."""
+        """Sums of squares of the measured forces, and of the errors of each row of `phi` (M, 12 L) by fold."""
         columns = {fold: self.builder.to_columns(values) for fold, values in phi.items()}
         count = 1 + len(next(iter(phi.values())))
 
@@ -665,7 +661,7 @@ class Evaluation:
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
 
     def _add(self, sums: Sequence[ForceSums], chunk: Chunk, state: ContactState, phi: Mapping[int, Tensor]) -> None:
-        """Add a chunk to the sums of the measured forces and of the errors at parameters by fold."""
+        """Add a chunk to the sums of the measured forces and of the errors."""
         builder = self.builder
         base = self.robot.base_rows
         joints = slice(base, base + self.robot.n)
@@ -718,7 +714,7 @@ class Evaluation:
 
 
 def compare_parts(nominal: Metrics, identified: Metrics) -> tuple[int, int, list[str]]:
-    """Of joints and axes of the base: how many are predicted better, of how many, and those that are clearly worse."""
+    """Count joints and base axes that are predicted better; return (better, all, names of clearly worse ones)."""
     better = 0
     known = 0
     worse = []
@@ -736,12 +732,12 @@ def compare_parts(nominal: Metrics, identified: Metrics) -> tuple[int, int, list
 
 
 def _is_worse(before: float, after: float, share: float | None) -> bool:
-    """Whether an error is clearly larger than before; `share`: of the measured, of the one after."""
+    """Whether an error is clearly larger than before; `share`: the error after, divided by the measured rms."""
     return after > _CLEARLY * before and after - before > _MATTERS * (after / share if share else 0.0)
 
 
 def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[WorseThanNominal]:
-    """Groups of rows where identified parameters are clearly worse; `sets`: nominal and identified metrics by logs."""
+    """Groups of rows with clearly larger errors after the fit; `sets`: nominal and identified metrics by logs."""
     worse = []
     for logs, (nominal, identified) in sets.items():
         for group in DECISIVE_GROUPS:
@@ -756,7 +752,7 @@ def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Wors
 
 @dataclass(frozen=True)
 class WorseThanNominal:
-    """A group of rows on a set of logs in which the nominal parameters predict better, with both errors."""
+    """A group of rows on a set of logs that the nominal parameters predict better, with both errors."""
 
     logs: str
     group: str
@@ -768,16 +764,16 @@ class WorseThanNominal:
 
 
 def describe_worse(groups: list[WorseThanNominal], nominal_label: str) -> str | None:
-    """One line that lists the groups, None if there are none; `nominal_label`: "URDF" or "MJCF"."""
+    """One line that lists such groups, None without any; `nominal_label`: "URDF" or "MJCF"."""
     if not groups:
         return None
     by_logs = {group.logs: [str(other) for other in groups if other.logs == group.logs] for group in groups}
     texts_by_logs = "; ".join(f"on {logs}: {join_names(texts)}" for logs, texts in by_logs.items())
-    return f"the identified parameters predict worse than the {nominal_label}'s, {texts_by_logs}"
+    return f"the identified parameters predict worse than the {nominal_label}, {texts_by_logs}"
 
 
 def describe_errors(group: str, identified: float | None, nominal: float | None) -> str | None:
-    """Both errors of a group of rows in words, None where it has none."""
+    """Both errors of a group of rows as text, None if one is unknown."""
     if identified is None or nominal is None:
         return None
     unit = _LABELS[group].split("[")[1].rstrip("]")

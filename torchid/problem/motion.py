@@ -25,6 +25,9 @@ MIN_MOTION = 0.01
 MIN_TURN_DEG = 1.0
 """Turn [degrees] from which on a base moves."""
 
+FROM_PREPROCESS = "the field; torchid.preprocess(log) computes it"
+"""What messages accept in place of a missing derivative."""
+
 _POSE_FIELDS = (
     "base_quat_xyzw",
     "base_angular_velocity_base",
@@ -35,19 +38,19 @@ _IMU_FIELDS = ("imu_specific_force", "imu_angular_velocity", "imu_angular_accele
 _ACCEPTED = {
     "base_quat_xyzw": "base_quat_wxyz or base_quat_xyzw, or imu_frame, imu_specific_force and imu_angular_velocity",
     "base_linear_acceleration_world": "base_position_world, base_linear_velocity_{world,base} or "
-    "base_linear_acceleration_{world,base}, or an IMU's readings",
+    "base_linear_acceleration_{world,base}, or IMU readings",
 }
 
 
 @dataclass(frozen=True)
 class BaseMotion:
-    """Motion of the base at N samples, as far as the dynamics depend on it, in the base frame; None where not known.
+    """Motion of the base at N samples, in the base frame, as the dynamics need it; None where unknown.
 
     Attributes:
         quat_xyzw: (N, 4), rotates base to world.
         specific_force: (N, 3), acceleration of the base origin minus gravity [m/s^2].
         angular_velocity, angular_acceleration: (N, 3) [rad/s, rad/s^2].
-        position: (N, 3) [m], of the origin in the world; for wrenches about the world's origin alone.
+        position: (N, 3) [m], of the origin in the world; only for wrenches about the world's origin.
     """
 
     quat_xyzw: Tensor | None = None
@@ -58,7 +61,7 @@ class BaseMotion:
 
     @classmethod
     def from_coordinates(cls, q: Tensor, v: Tensor, a: Tensor, fixed_base: bool = False) -> BaseMotion:
-        """The base's motion in q (B, n + 7), v, a (B, n + 6), as `Regressor` takes them; empty for a fixed base."""
+        """Motion of the base from q (B, n + 7), v, a (B, n + 6), as `Regressor` takes them; empty for a fixed base."""
         if fixed_base:
             return cls()
         motion = motion_from_state(q, v, a, q.shape[1] - 7)
@@ -67,13 +70,13 @@ class BaseMotion:
         )
 
     def map(self, function: Callable[[Tensor], Tensor]) -> BaseMotion:
-        """The same motion with a function applied to every tensor."""
+        """Apply a function to every tensor."""
         return BaseMotion(**{name: function(x) for name, x in vars(self).items() if x is not None})
 
     def tilted(self, tilt: Sequence[float] | Array, count: int) -> BaseMotion:
-        """The motion of a base that is turned in the recorded one by angles about x and y [rad], a rotation vector.
+        """Motion of a base that is rotated relative to the recorded one by a rotation vector about x and y [rad].
 
-        `count`: of the samples, of which nothing may be known. The noise of the motion is taken to be the same.
+        `count`: number of samples, for an unknown motion. The motion noise does not change.
         """
         if not np.any(tilt):
             return self
@@ -95,9 +98,9 @@ class BaseMotion:
 def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
     """Axes of the levelled base in the base frame, (N, 3, 3), as columns.
 
-    The smallest rotation makes the base axis nearest to the vertical exactly vertical, so that tilting mixes no noise
-    of the horizontal axes into the vertical one. The nearest axis may change where the base is tilted by 45 degrees;
-    the rotation is at most 55 degrees and thus always defined.
+    The smallest rotation makes the base axis nearest to the vertical exactly vertical. So a tilted base does not mix
+    noise of the horizontal axes into the vertical one. The nearest axis may change at a tilt of 45 degrees; the
+    rotation is at most 55 degrees, so it is always defined.
 
     Args:
         rotation_world_base: (N, 3, 3), base to world.
@@ -117,18 +120,18 @@ def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
 def base_motion(log: Log, robot: Robot) -> BaseMotion:
     """Motion of the robot's base in a preprocessed log; for a fixed base only its orientation.
 
-    An IMU is preferred: the dynamics depend on just what it measures, without differentiation. The orientation is kept
-    for wrenches along world axes.
+    An IMU is preferred, because it measures what the dynamics need without differentiation. The orientation is kept for
+    wrenches along world axes.
 
     Raises:
-        LogError: neither the base's motion nor IMU readings, or an IMU that is not on the base.
-        UnknownNameError: an IMU frame that the robot does not have.
+        LogError: the log has neither the base's motion nor IMU readings, or the IMU is not on the base.
+        UnknownNameError: the robot has no such IMU frame.
     """
     return _recorded_base(log, robot).tilted(robot.base_tilt, len(log))
 
 
 def _recorded_base(log: Log, robot: Robot) -> BaseMotion:
-    """As `base_motion`, but of the base as it was recorded, which is that of the robot but for its tilt."""
+    """As `base_motion`, of the recorded base, without the robot's `base_tilt`."""
     quat = None if log.base_quat_xyzw is None else torch.from_numpy(log.base_quat_xyzw)
     if robot.fixed_base:
         return BaseMotion(quat)
@@ -136,20 +139,20 @@ def _recorded_base(log: Log, robot: Robot) -> BaseMotion:
         return _from_imu(log, robot, quat)
     missing = [name for name in _POSE_FIELDS if getattr(log, name) is None]
     if missing or quat is None:
-        accepted = _ACCEPTED.get(missing[0], f"{missing[0]}, or a log passed through preprocess()")
-        raise LogError(log.source, missing[0], "missing, though the base floats", accepted)
+        accepted = _ACCEPTED.get(missing[0], FROM_PREPROCESS)
+        raise LogError(log.source, missing[0], "missing, but the robot has a floating base", accepted)
     _, omega, alpha, acceleration = (torch.from_numpy(getattr(log, name)) for name in _POSE_FIELDS)
     force = acceleration - acceleration.new_tensor(GRAVITY_WORLD)
     return BaseMotion(quat, (rotation_matrix(quat).mT @ force[..., None])[..., 0], omega, alpha)
 
 
 def position_for_moments(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Tensor | None:
-    """Position of the base in the world, (N, 3) [m], where moments of contacts are about the world's origin; else None.
+    """Position of the base in the world, (N, 3) [m], if contact moments are about the world's origin; else None.
 
-    A fixed base of which no pose was recorded is the world.
+    A fixed base without a recorded pose is at the world's origin.
 
     Raises:
-        LogError: it was not recorded.
+        LogError: the position is missing.
     """
     has_moments = any(max(contact.components) >= 3 and not contact.along_normal for contact in contacts)
     if not log.moments_about_world_origin or not has_moments:
@@ -158,8 +161,8 @@ def position_for_moments(log: Log, robot: Robot, contacts: Sequence[Contact]) ->
         return torch.from_numpy(log.base_position_world)
     if robot.fixed_base and log.base_quat_xyzw is None:
         return torch.zeros(len(log), 3, dtype=torch.float64)
-    reason = "given without base_position_world, by which moments are moved to the contact frames"
-    accepted = "base_position_world and the base's orientation in the same world, or moments about the frames' origins"
+    reason = "moments about the world's origin need base_position_world, which is missing"
+    accepted = "base_position_world and the base's orientation, or moments about the origins of the contact frames"
     raise LogError(log.source, POINTS, reason, accepted)
 
 
@@ -173,11 +176,11 @@ def _links_on_base(robot: Robot) -> list[str]:
 
 
 def imu_pose(log: Log, robot: Robot) -> tuple[Rotation, Array]:
-    """Rotation of the IMU's frame into the base's, and its origin there, (3,) [m].
+    """Rotation of the IMU frame into the base frame, and its origin there, (3,) [m].
 
     Raises:
-        LogError: an IMU that is not on the base.
-        UnknownNameError: a frame that the robot does not have.
+        LogError: the IMU is not on the base.
+        UnknownNameError: the robot has no such frame.
     """
     if log.imu_frame not in robot.links:
         raise UnknownNameError(log.source, "imu_frame", log.imu_frame, _links_on_base(robot))
@@ -186,7 +189,7 @@ def imu_pose(log: Log, robot: Robot) -> tuple[Rotation, Array]:
         body = joint.parent
         T_base_imu = joint.T_parent_joint @ joint.T_joint_link @ T_base_imu
     if body != 0:
-        reason = f"'{log.imu_frame}', which moves with {robot.bodies[body].name}"
+        reason = f"'{log.imu_frame}' is on {robot.bodies[body].name}, not on the base"
         raise LogError(log.source, "imu_frame", reason, f"a frame on the base: {', '.join(_links_on_base(robot)[:8])}")
     return Rotation.from_matrix(T_base_imu[:3, :3]), T_base_imu[:3, 3]
 
@@ -196,7 +199,7 @@ def _from_imu(log: Log, robot: Robot, quat: Tensor | None) -> BaseMotion:
     rotation, arm = imu_pose(log, robot)
     for name in _IMU_FIELDS:
         if getattr(log, name) is None:
-            raise LogError(log.source, name, "missing", f"{name}, or a log passed through preprocess()")
+            raise LogError(log.source, name, "missing", FROM_PREPROCESS)
     force, omega, alpha = (rotation.apply(getattr(log, name)) for name in _IMU_FIELDS)
     at_origin: Array = force - np.cross(alpha, arm) - np.cross(omega, np.cross(omega, arm))
     return BaseMotion(quat, *map(torch.from_numpy, (at_origin, omega, alpha)))
@@ -219,14 +222,14 @@ _TICK = 1e-5  # [s] of stamps, whose last bits differ between formats of files
 
 @dataclass(frozen=True)
 class MotionNoise:
-    """Noise of the motion of some samples of one log: Gaussian at each instant, whatever neighbours have.
+    """Noise of the motion of one log's samples: Gaussian and independent between samples.
 
     Attributes:
         joints: (n, 3, 3), symmetric square roots of the covariances of position, velocity and acceleration.
-        base: (12, 12), that of the base's orientation (a small rotation in the base frame), angular velocity, angular
+        base: (12, 12), that of the base's orientation (small rotation in the base frame), angular velocity, angular
             acceleration and specific force [rad, rad/s, rad/s^2, m/s^2].
-        turns_force: whether the specific force comes from an acceleration in the world, which is turned by the
-            orientation that was measured.
+        turns_force: whether the specific force comes from an acceleration in the world, rotated by the measured
+            orientation.
     """
 
     joints: Tensor
@@ -236,8 +239,8 @@ class MotionNoise:
     def drawn(self, time: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
         """Noise of joints, (3, B, n), and of the base, (B, 12), at time stamps (B,), times a `size`, (B, 1).
 
-        Each of some independent sources has one standard deviation, to one side or the other, which is drawn by the
-        time stamp: samples get the same noise wherever they are.
+        Each independent source is plus or minus one standard deviation; the time stamp determines the sign, so a sample
+        always gets the same noise.
         """
         count = self.joints.shape[0]
         side = size * random_sides(time, 3 * count + len(self.base))
@@ -265,13 +268,13 @@ class MotionNoise:
 def bind_motion_noise(
     log: Log, joints: Sequence[int], fixed_base: bool, imu: tuple[Rotation, Array] | None
 ) -> MotionNoise | None:
-    """The noise of a preprocessed log's motion, None if it has none.
+    """Noise of a preprocessed log's motion; None without noise.
 
     Args:
         log: the log.
-        joints: its joints' columns, in the robot's order.
+        joints: columns of its joints in the robot's order.
         fixed_base: whether the base does not move.
-        imu: rotation of the IMU's frame into the base's and its origin there, (3,) [m]; None without one.
+        imu: rotation of the IMU frame into the base frame and its origin there, (3,) [m]; or None.
     """
     noise = log.motion_noise
     if noise is None or not noise.found:
@@ -294,12 +297,12 @@ def bind_motion_noise(
 
 
 def _chain(std: Mapping[str, Array], names: Sequence[str], derivatives: Array, count: int) -> Array:
-    """Covariances, (count, 3, 3), of quantities by name, of which each that was not recorded is derived from the last.
+    """Covariances, (count, 3, 3), of quantities by name; each unrecorded one is the derivative of the one before.
 
     Args:
         std: of the recorded ones, (count,).
         names: at most 3, each the derivative of the one before.
-        derivatives: as `SignalNoise` has them.
+        derivatives: as in `SignalNoise`.
         count: of channels.
     """
     out = np.zeros((count, 3, 3))
@@ -311,7 +314,7 @@ def _chain(std: Mapping[str, Array], names: Sequence[str], derivatives: Array, c
 
 
 def _of_imu(noise: SignalNoise, rotation: Rotation, arm: Array) -> Array:
-    """Covariance (12, 12) of the base's motion by an IMU with a lever arm; centripetal acceleration aside."""
+    """Covariance (12, 12) of the base's motion from an IMU with a lever arm, without centripetal acceleration."""
     sources = np.zeros((9, 9))  # angular velocity, angular acceleration, specific force
     for axis, covariance in enumerate(_chain(noise.std, _GYRO, noise.derivatives, 3)):
         sources[axis:6:3, axis:6:3] = covariance[:2, :2]
@@ -326,13 +329,13 @@ def _of_imu(noise: SignalNoise, rotation: Rotation, arm: Array) -> Array:
 
 
 def _square_root(covariance: Array) -> Array:
-    """Symmetric S with S S = covariance, (..., k, k), which need not have full rank; others would hang on rounding."""
+    """Symmetric S with S S = covariance, (..., k, k), also for singular covariances."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :] @ np.swapaxes(vectors, -1, -2))
 
 
 def random_sides(time: Tensor, count: int) -> Tensor:
-    """+1 or -1 for each sample and source, (B, count), drawn by the samples' stamps (B,), at random to all appearances.
+    """Pseudo-random +1 or -1 for each sample and source, (B, count), determined by the time stamps (B,).
 
     Source: splitmix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
     """

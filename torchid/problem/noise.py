@@ -1,15 +1,14 @@
-"""Noise of the sensors and of the base rows from residuals of a fit, at some of the samples: variance components.
+"""Noise of the sensors and of the base rows, estimated from residuals of a fit (variance components).
 
-Every whitened, projected row mixes the noise of several sensors. But each sensor enters the rows of a sample along
-known directions, which differ between postures and contact states. The variances are those at which the expected
-covariance of the residuals equals the observed one (Rao's MINQUE, iterated, which is restricted maximum likelihood;
-Searle, Casella and McCulloch, "Variance Components", 1992, chapters 6 and 11).
+Every whitened, projected row mixes the noise of several sensors. Each sensor enters the rows of a sample along known
+directions, which differ between postures and contact states. The variances are those at which the expected covariance
+of the residuals equals the observed one (Rao's MINQUE, iterated, which is restricted maximum likelihood; Searle,
+Casella and McCulloch, "Variance Components", 1992, chapters 6 and 11).
 
-Logarithms of variances of sources that are alike, such as motors of one make, are normal about a common mean, neither
-of which is known: where residuals determine each, it keeps its own, and where they do not, it has that of all. How far
-they are apart is estimated too (restricted maximum likelihood of a normal random effect; Breslow and Clayton,
-"Approximate Inference in Generalized Linear Mixed Models", 1993; of variances: Smyth, "Linear Models and Empirical
-Bayes Methods", 2004).
+Similar sources, such as motors of one make, have log-variances that are normal about a common mean. A source that the
+residuals determine keeps its own variance; another gets that of all. Their spread is estimated too (restricted maximum
+likelihood of a normal random effect; Breslow and Clayton, "Approximate Inference in Generalized Linear Mixed Models",
+1993; of variances: Smyth, "Linear Models and Empirical Bayes Methods", 2004).
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ CLIP = 3.0
 
 
 def noise_of_sensors(builder: RowBuilder) -> dict[str, float]:
-    """Standard deviation of every group that a builder's sensors have, in `NoiseGroups`' order [N m, N]."""
+    """Standard deviation of every sensor group of a builder, in the order of `NoiseGroups` [N m, N]."""
     names = set(builder.noise_sources)
     values = builder.noise_groups.values(builder.sensors.noise)
     return {name: value for name, value in values.items() if name in names}
@@ -57,8 +56,8 @@ def noise_of_sensors(builder: RowBuilder) -> dict[str, float]:
 class SampledChunk:
     """Samples of one log in one contact state.
 
-    `rows`, (B, n_rows, width + 1), whitened with the noise of the builder; `sources`, (B, E, n_rows), one standard
-    deviation of each source of noise in these rows.
+    `rows`, (B, n_rows, width + 1), whitened with the builder's noise. `sources`, (B, E, n_rows), one standard deviation
+    of each noise source in these rows.
     """
 
     log: str
@@ -70,7 +69,7 @@ class SampledChunk:
 
 @dataclass(frozen=True)
 class LogOfOtherProcess:
-    """A log that another process has: its number of samples, and their oversampling."""
+    """A log in another process: its number of samples, and their oversampling."""
 
     count: int
     oversampling: float
@@ -80,13 +79,13 @@ class LogOfOtherProcess:
 
 
 class SampledRows:
-    """Rows of about a thousand samples of the logs, in memory, to be whitened again with other noise.
+    """Rows of about a thousand samples of the logs, in memory, to whiten again with other noise.
 
     Attributes:
-        builder: of the rows; its sensors' noise is the stated one, which variances are relative to.
-        groups: those that the sensors have, in `NoiseGroups`' order.
-        alike: indices of groups whose noise may be of one size.
-        group_of: (E,), index among `groups` of every source of noise.
+        builder: of the rows; variances are relative to its sensor noise, the stated one.
+        groups: sensor groups, in the order of `NoiseGroups`.
+        alike: indices of groups whose noise may have the same size.
+        group_of: (E,), index in `groups` of every noise source.
     """
 
     @one_thread()
@@ -94,12 +93,13 @@ class SampledRows:
     def __init__(self, logs: Sequence[Samples | LogOfOtherProcess], builder: RowBuilder, chunk: int = _CHUNK) -> None:
         """Compute the rows of random samples, always the same ones.
 
-        Logs elsewhere are those of processes that share the work, each with successive ones; all get the rows of all.
+        Among processes that share the work, each has some of the logs; all get the rows of all logs.
 
         Args:
             logs: bound logs.
-            builder: of their rows.
-            chunk: samples at a time; their number rounds otherwise, which moves an ill-determined noise by per cents.
+            builder: of the rows.
+            chunk: samples at a time. Another number rounds differently, which changes ill-determined noise by a few
+                percent.
         """
         self.builder = builder
         names = builder.noise_sources
@@ -116,12 +116,12 @@ class SampledRows:
             builder.layout_of(samples, state)
         self.chunks = map_in_workers(drawn, lambda drawn_chunk: self._chunk(*drawn_chunk), worker_count(builder.device))
         elsewhere = any(isinstance(log, LogOfOtherProcess) for log in logs)
-        if any(distributed.all_gather(elsewhere, "logs that others have")):
-            self.chunks = list(chain.from_iterable(distributed.all_gather(self.chunks, "samples for the noise")))
+        if any(distributed.all_gather(elsewhere, "remote logs")):
+            self.chunks = list(chain.from_iterable(distributed.all_gather(self.chunks, "noise samples")))
 
     @property
     def reference_std(self) -> Array:
-        """Stated standard deviation of each group, which variances are relative to, (G,) [N m, N]."""
+        """Stated standard deviation of each group, (G,) [N m, N]; variances are relative to it."""
         return np.array([*noise_of_sensors(self.builder).values()])
 
     @property
@@ -155,9 +155,9 @@ class SampledRows:
         return torch.cat(forces, dim=1)
 
     def whiten(self, chunk: SampledChunk, variance: Array, step: int = 1) -> SampledChunk:
-        """A chunk whitened with variances of the groups relative to the stated ones, (G,).
+        """Whiten a chunk with variances of the groups relative to the stated ones, (G,).
 
-        Of its `rows` those of every `step`-th sample.
+        Uses every `step`-th sample of the `rows`.
         """
         if (variance == 1.0).all():
             return replace(chunk, rows=chunk.rows[::step])
@@ -168,11 +168,11 @@ class SampledRows:
 
     @one_thread()
     def compress(self, variance: Array, columns: Mapping[str, Tensor] | None = None) -> list[Part]:
-        """The rows, whitened with these variances and compressed.
+        """Compress the rows, whitened with these variances.
 
-        With parameters of an earlier fit in the builder's columns, by log, samples with large residuals count less, as
-        in Huber's loss: otherwise the effect of impacts on the parameters would look like noise of all rows. A sample's
-        rows are taken together, as another basis of their span must not make a difference.
+        With parameters of an earlier fit (in the builder's columns, by log), samples with large residuals get less
+        weight, as in Huber's loss; otherwise impacts would look like noise of all rows. All rows of a sample get one
+        weight, because their basis is arbitrary.
         """
 
         def factor_of(chunk: SampledChunk) -> TriangularFactor:
@@ -206,13 +206,13 @@ class SampledRows:
 
 
 def noise_root(sources: Tensor) -> Tensor:
-    """L (B, r, r) with `L L^T` the covariance of rows that have these sources (B, e, r); 1 of rows of zeros."""
+    """L (B, r, r) with `L L^T` the covariance of rows with these noise sources (B, e, r); 1 for rows of zeros."""
     S = sources.mT @ sources
     return torch.linalg.cholesky(S + torch.diag_embed((S.diagonal(dim1=-2, dim2=-1) == 0.0).to(S)))
 
 
 def _sources_of_scales(builder: RowBuilder) -> dict[int, list[int]]:
-    """Numbers of the sources of noise of readings with an unknown scale, by its column."""
+    """Noise sources of readings with an unknown scale, by the column of the scale."""
     base = builder.tree.base_rows
     torque = np.asarray(builder.sensors.torque)
     components = measured_components(builder.contacts, builder.sensors)
@@ -226,7 +226,7 @@ def _sources_of_scales(builder: RowBuilder) -> dict[int, list[int]]:
 
 
 def supports(rows: Tensor) -> dict[tuple[int, ...], list[int]]:
-    """Columns in which rows (B, n_rows, width + 1), right-hand side last, are not zero: numbers of rows by these."""
+    """Numbers of rows (B, n_rows, width + 1), right-hand side last, by their non-zero columns."""
     out: dict[tuple[int, ...], list[int]] = {}
     for slot, used in enumerate((rows[..., :-1] != 0.0).any(0).numpy()):
         out.setdefault(tuple(np.flatnonzero(used).tolist()), []).append(slot)
@@ -234,16 +234,16 @@ def supports(rows: Tensor) -> dict[tuple[int, ...], list[int]]:
 
 
 def _radius(rows: Tensor) -> Tensor:
-    """Size of whitened residuals of so many rows that is exceeded as seldom as `CLIP` standard deviations by one."""
+    """Size of that many whitened residuals with the same probability of excess as `CLIP` standard deviations of one."""
     return torch.from_numpy(np.sqrt(chdtri(rows.numpy(), 2.0 * ndtr(-CLIP))))
 
 
 def _random_chunks(
     logs: Sequence[Samples | LogOfOtherProcess], most: int, chunk: int
 ) -> Iterator[tuple[Samples, ContactState]]:
-    """About `most` random samples (regular ones could be in phase with a gait), log by log and state by state.
+    """About `most` random samples, by log and contact state (regular ones could be in phase with a gait).
 
-    Of filtered logs at most four for every independent sample: more would add little.
+    Filtered logs give at most four samples for every independent one.
     """
     rng = np.random.default_rng(0)
     share = min(1.0, most / max(sum(map(len, logs)), 1))
@@ -264,12 +264,12 @@ _HELD_OTHERS = 1e-6  # share of the information on other variances that is added
 
 
 def information_about(index: np.ndarray, information: Array, score: Array) -> tuple[Array, Array]:
-    """Information (k, k) and score (k,) on the logarithms of some variances, while others are estimated too.
+    """Information (k, k) and score (k,) for the logarithms of some variances, with the others estimated too.
 
     Args:
         index: (k,), of these variances.
-        information: Fisher information on the logarithms of all, (U, U).
-        score: derivative of the likelihood by them, (U,).
+        information: Fisher information for the logarithms of all, (U, U).
+        score: derivative of the likelihood, (U,).
     """
     others = np.setdiff1d(np.arange(len(score)), index)
     known = information[np.ix_(others, others)]
@@ -330,15 +330,15 @@ _POOLED = 0.5  # share of the prior in what determines a variance
 
 @dataclass(frozen=True)
 class GroupVariances:
-    """Variances of the groups relative to the stated ones, those of the builder of `SampledRows`.
+    """Variances of the groups relative to the stated ones (the noise of the builder of `SampledRows`).
 
     Attributes:
         variance: (G,).
-        share: (G,), the group's own share of the variance along its directions, between 0 and 1.
-        estimated: (G,) bool, whether there were enough readings; if not, the variance is unchanged.
-        error: (G,), relative standard error of the standard deviation, large where groups are confounded.
-        pooled: (G,) bool, whether it is that of groups that are alike rather than its own.
-        change: largest relative change of the noise of all groups along the directions of any group since the start.
+        share: (G,), fraction of the variance along a group's directions that is its own, between 0 and 1.
+        estimated: (G,) bool, whether there were enough readings; otherwise the variance is unchanged.
+        error: (G,), relative standard error of the standard deviation, large for confounded groups.
+        pooled: (G,) bool, whether the value is mostly that of similar groups.
+        change: largest relative change of the noise along the directions of any group.
     """
 
     variance: Array
@@ -350,7 +350,7 @@ class GroupVariances:
 
     @classmethod
     def unknown(cls, count: int) -> GroupVariances:
-        """As stated, of residuals that tell nothing."""
+        """The stated variances, if residuals contain no information."""
         none = np.zeros(count, dtype=bool)
         ones = np.ones(count)
         return cls(ones, share=ones, estimated=none, error=ones, pooled=none, change=0.0)
@@ -370,7 +370,7 @@ class VarianceComponentEstimator:
     """Estimates variances of groups from residuals at fitted parameters."""
 
     def __init__(self, rows: SampledRows, tied: Collection[str] = ()) -> None:
-        """Estimate one common factor for the variances of the `tied` groups."""
+        """Set the `tied` groups, which share one factor."""
         self.rows = rows
         count = len(rows.groups)
         kept = [index for index, name in enumerate(rows.groups) if name in tied]
@@ -390,13 +390,14 @@ class VarianceComponentEstimator:
     ) -> GroupVariances:
         """Variances at which the expected covariance of the residuals equals the observed one.
 
-        Residuals are clipped. A fit makes them smaller; each group is corrected by the leverage of its own directions.
-        Its standard deviation is at least a tenth of that along its directions, and `_SMALLEST` of the stated noise.
+        Residuals are clipped. The fit reduces them; each group is corrected by the leverage of its own directions. A
+        standard deviation is at least a tenth of that along the group's directions, and `_SMALLEST` of the stated
+        noise.
 
         Args:
-            variance: (G,), initial values, with which the parameters were fitted.
+            variance: (G,), initial values, used in the fit of the parameters.
             columns: parameters in the builder's columns, (width,), by log.
-            directions: that the fit was free in, by log, from `fitted_directions`.
+            directions: free directions of the fit, by log, from `fitted_directions`.
         """
         start = variance
         residuals, remaining, independent = self._residuals(variance, columns, directions)
@@ -427,22 +428,22 @@ class VarianceComponentEstimator:
         )
 
     def _enough(self, readings: Array) -> np.ndarray:
-        """Groups whose readings are enough for an estimate, with those of groups that are alike, (G,) bool."""
+        """Groups with enough readings for an estimate, their own or those of similar groups, (G,) bool."""
         enough = readings > _FEW
         for index in self._alike:
             enough[index] = readings[index].sum() > _FEW
         return enough
 
     def _information(self, M: Array, remaining: Array) -> Array:
-        """Fisher information of Gaussian noise on the logarithms of the variances, (G, G)."""
+        """Fisher information of Gaussian noise for the logarithms of the variances, (G, G)."""
         return M * np.sqrt(np.outer(remaining, remaining)) / (2.0 * self.rows.oversampling)
 
     def _prior(self, M: Array, q: Array, variance: Array, remaining: Array) -> tuple[Array, Array, Array]:
-        """That groups which are alike have variances of one size, as far as residuals show it.
+        """Prior that similar groups have variances of one size, as far as residuals support it.
 
         Returns:
-            Precision of the logarithms of the variances, (G, G), zero of all others; its part of the equations
-            M x = q, with x the factors of the variances: (G, G) and (G,).
+            Precision of the logarithms of the variances, (G, G), zero for all others; and its part of the equations M x
+                = q, with x the factors of the variances: (G, G) and (G,).
         """
         count = len(variance)
         oversampling = self.rows.oversampling
@@ -514,11 +515,11 @@ class VarianceComponentEstimator:
     def _residuals(
         self, variance: Array, columns: Mapping[str, Tensor], directions: Mapping[str, Tensor]
     ) -> tuple[list[Tensor], Array, Array]:
-        """Residuals of the rows, (B, n_rows) by chunk, and what of each group remains.
+        """Residuals of the rows, (B, n_rows) by chunk, and the degrees of freedom of each group.
 
         Returns:
-            The residuals; the share of each group's degrees of freedom that remains after the fit, (G,); its number of
-            independent readings, (G,).
+            The residuals; the fraction of each group's degrees of freedom that remains after the fit, (G,); its number
+                of independent readings, (G,).
         """
         rows = self.rows
         group_of = self.rows.group_of
@@ -545,7 +546,7 @@ class VarianceComponentEstimator:
 
 
 def _forces(rows: SampledRows) -> Array:
-    """Rms of what the sources of each group read, (G,), in their stated noise; of all rows where that is nothing."""
+    """Rms of the readings of each group, (G,), in units of its stated noise; of all rows where that is zero."""
     squares = np.zeros(len(rows.groups))
     sizes = np.zeros(len(rows.groups))
     for chunk in rows.chunks:
@@ -559,7 +560,7 @@ def _forces(rows: SampledRows) -> Array:
 
 
 def _is_pooled(precision: Array, error: Array) -> np.ndarray:
-    """Whether the prior weighs more than the residuals in a group's variance, whose deviation has such errors."""
+    """Whether the prior has more weight than the residuals in a group's variance."""
     of_prior = np.diag(precision)
     return (of_prior > 0.0) & (np.square(2.0 * error) > _POOLED / np.where(of_prior > 0.0, of_prior, 1.0))
 

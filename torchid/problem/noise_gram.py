@@ -1,12 +1,12 @@
-"""What noise of the motion, and of readings with unknown scales, adds to the normal equations; factors without it.
+"""Contribution of motion noise, and of readings with unknown scales, to the normal equations, and its removal.
 
-Noise of positions, velocities and accelerations makes a regressor larger on average: X^T X grows by the covariance of
-the noise in X, and parameters that rest on noisy columns come out too small. Samples with as much noise again show by
-how much it grows, pairs of opposite noise without what is linear in it. Taken off, the normal equations are those of
-the true motion on average (corrected least squares).
+Noise of positions, velocities and accelerations enlarges the regressor on average: X^T X grows by the covariance of the
+noise in X, and the parameters of noisy columns become too small. Samples with the same amount of noise added again show
+this growth; pairs of opposite noise cancel its linear part. After the subtraction, the normal equations are on average
+those of the true motion (corrected least squares).
 
-Source: Fuller, "Measurement Error Models", 1987, section 2.2; the noise that is added as in simulation extrapolation
-(Cook, Stefanski, JASA 89, 1994), to the sufficient statistics instead of to the estimate.
+Source: Fuller, "Measurement Error Models", 1987, section 2.2. The noise is added as in simulation extrapolation (Cook,
+Stefanski, JASA 89, 1994), but to the sufficient statistics instead of the estimate.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ NoiseGram = dict[tuple[int, ...], Tensor]
 
 
 class PartKey(NamedTuple):
-    """Which rows of some logs belong together: those of one log, contact state, fold and block; see `Part`."""
+    """Key of rows that belong together: log, contact state, fold and block; see `Part`."""
 
     source: str
     state: ContactState
@@ -59,18 +59,18 @@ class PartKey(NamedTuple):
 
     @classmethod
     def spans(cls, samples: Samples, state: ContactState) -> list[tuple[PartKey, int, int]]:
-        """Keys of the parts that a chunk has rows of, each with the first of its samples and the end."""
+        """Keys of the parts in a chunk, each with its first sample and its end."""
         return [(cls(samples.source, state, fold, block), a, b) for fold, block, a, b in blocks_in(samples)]
 
 
 @dataclass(frozen=True)
 class NoiseShares:
-    """How much of the information on combinations of parameters was noise of the motion, and has been taken off.
+    """Fractions of motion noise in the information on parameter combinations, before its subtraction.
 
     Attributes:
-        combinations: that the rows determine, 0 of motion without noise.
-        largest: share of noise in any of them.
-        lost: combinations of which more than `LEAST_SIGNAL` leaves is noise, which remain near the nominal ones.
+        combinations: number of combinations that the rows determine; 0 without motion noise.
+        largest: largest fraction of noise.
+        lost: number of combinations with more than 1 - `LEAST_SIGNAL` noise, which stay near the nominal values.
     """
 
     combinations: int = 0
@@ -79,13 +79,13 @@ class NoiseShares:
 
     @classmethod
     def of(cls, shares: Array) -> NoiseShares:
-        """Of the share of each combination."""
+        """From the fraction of each combination."""
         return cls(len(shares), max(float(shares.max(initial=0.0)), 0.0), int((shares > 1.0 - LEAST_SIGNAL).sum()))
 
     def __str__(self) -> str:
-        text = f"up to {format_percent(self.largest)} % of the information on a combination was noise, taken off"
+        text = f"up to {format_percent(self.largest)} % of the information on a combination is noise; it is subtracted"
         if self.lost:
-            text += f" but for {self.lost} of {self.combinations}, mostly noise, which remain near the nominal ones"
+            text += f". {self.lost} of {self.combinations} are mostly noise and stay near the nominal values"
         return text
 
 
@@ -95,23 +95,22 @@ def scale_columns(builder: RowBuilder) -> list[int]:
 
 
 def noise_of_reading(column: int, size: Tensor) -> NoiseGram:
-    """What noise of readings with an unknown scale adds, of which this is the sum of squares in the rows.
+    """Contribution of noise in readings with an unknown scale; `size` is its sum of squares in the rows.
 
-    A reading is a force, and minus the column of its scale. No rows have this column alone: its size, unlike that of
-    noise of the motion, follows from a fit.
+    The reading enters the force and, negated, the column of its scale. The size of this noise follows from a fit.
     """
     return {(column,): size * size.new_tensor([[1.0, -1.0], [-1.0, 1.0]])}
 
 
 def estimate_noise_gram(logs: Sequence[Samples], builder: RowBuilder) -> dict[PartKey, NoiseGram]:
-    """What noise of their motion adds to X^T X of the rows of each part of some logs; nothing without noise.
+    """Estimate the contribution of motion noise to X^T X for each part of logs; empty without noise.
 
     Args:
         logs: bound logs, or pieces of them in the order of their samples, with their folds and blocks.
         builder: of the rows.
     """
     scaled = bool(scale_columns(builder))
-    step = distributed.broadcast(max(1, sum(map(len, logs)) // _perturbed(logs)), "samples with noise")
+    step = distributed.broadcast(max(1, sum(map(len, logs)) // _perturbed(logs)), "noise samples")
     by_log: dict[str, list[Samples]] = {}
     for piece in logs:
         if (scaled or piece.motion_noise is not None) and len(piece):
@@ -136,11 +135,11 @@ def _add(total: NoiseGram, noise_gram: NoiseGram, weight: float) -> None:
 
 
 def _perturbed(pieces: Sequence[Samples]) -> int:
-    """Number of samples that noise is added to, if there are so many: that of independent ones, within limits.
+    """Number of samples to add noise to: that of independent ones, within limits.
 
-    Let noise be a share s of the information on a combination of parameters, and a share h of the mean square residual.
-    By n samples of N independent ones the variance of the combination grows by 2 s h N / n of itself: not at all for
-    s of a per cent, by 4 % for s = 0.2 and h = 0.1 (encoders with 1e-3 rad of noise) and n = N.
+    Let noise be a fraction s of the information on a combination of parameters, and a fraction h of the mean square
+    residual. With n of N independent samples the variance of the combination grows by the fraction 2 s h N / n: not
+    noticeably for s = 0.01, by 4 % for s = 0.2, h = 0.1 (encoders with 1e-3 rad of noise) and n = N.
     """
     independent = sum(len(piece) / piece.oversampling for piece in pieces)
     return int(min(max(independent, _LEAST_PERTURBED), _MOST_PERTURBED))
@@ -157,10 +156,10 @@ def _spread(piece: Samples, step: int) -> Samples:
 
 
 def _copies(spans: Sequence[tuple[int, int]]) -> tuple[Tensor, Tensor]:
-    """Of successive samples, span by span: all as they are, then all to one side, then all to the other.
+    """Copies of successive samples, span by span: unchanged, then with positive, then with negative noise.
 
     Returns:
-        which samples, (3 B,), and the side that noise moves each to, (3 B,).
+        Numbers of the samples, (3 B,), and the sign of their noise, (3 B,).
     """
     at = torch.cat([torch.arange(*span).repeat(_COPIES) for span in spans])
     lengths = torch.tensor([end - start for start, end in spans])
@@ -172,7 +171,7 @@ def _copies(spans: Sequence[tuple[int, int]]) -> tuple[Tensor, Tensor]:
 def _noise_gram_of_chunks(
     builder: RowBuilder, chunks: Iterator[tuple[Samples, ContactState]]
 ) -> dict[PartKey, NoiseGram]:
-    """By part: half of what pairs of samples with noise have more."""
+    """Noise Gram matrix by part: half of the growth of X^T X for pairs of samples with noise."""
     out: dict[PartKey, NoiseGram] = {}
     workspace = builder.workspaces.take()
     scales = set(scale_columns(builder))
@@ -207,12 +206,12 @@ def _noise_gram_of_chunks(
 
 @dataclass(frozen=True)
 class ColumnPrior:
-    """What is known of the bodies' parameters, in the first columns of a factor, before any rows.
+    """Prior of the bodies' parameters, in the first columns of a factor.
 
     Attributes:
         nominal: (count,).
-        spread: (count, P), deviations from them for each of P independent ones of unit variance.
-        reading_noise: as `Assembly` has it.
+        spread: (count, P), deviations for each of P independent deviations of unit variance.
+        reading_noise: as in `Assembly`.
     """
 
     nominal: Array
@@ -222,14 +221,13 @@ class ColumnPrior:
 
 @dataclass(frozen=True)
 class CorrectedTriangle:
-    """A factor without what noise of the motion adds.
+    """A factor without the contribution of motion noise.
 
     Attributes:
         R: (columns + 1, columns + 1), upper triangular, right-hand side last.
-        noise: what has been taken off.
-        shrinkage: (columns, P + extra parameters), None without any: by how much the parameters that fit R best do not
-            follow deviations from the nominal ones: unit ones of the prior, and those of extra parameters as they are
-            found. They follow all of those that are not mostly noise.
+        noise: the subtracted noise.
+        shrinkage: (columns, P + extra parameters), or None. By how much the best fit of R does not follow deviations
+            from the nominal parameters: unit deviations of the prior, and those of extra parameters.
     """
 
     R: Array
@@ -239,16 +237,15 @@ class CorrectedTriangle:
 
 @one_thread()
 def corrected_triangle(factor: TriangularFactor, prior: ColumnPrior) -> CorrectedTriangle:
-    """A factor without what noise of the motion adds to its rows.
+    """Subtract the contribution of motion noise from a factor.
 
-    Residuals remain those of the rows at the parameters that fit R best. Noise that would leave more of the rows
-    unexplained than these is taken to be as much smaller, as total least squares has it. With a share of noise s in
-    the information on a combination, of which 1 - `LEAST_SIGNAL` is taken off at most, the combination follows its data
-    by (1 - s) / `LEAST_SIGNAL` and the prior by the rest, as with a ridge. By chance s may exceed 1; the data then give
-    nothing of it.
+    Residuals remain those of the rows at the parameters that fit R best. Noise larger than the unexplained part of the
+    rows is reduced to that part, as in total least squares. If a combination has the fraction s of noise, at most 1 -
+    `LEAST_SIGNAL` is subtracted. The combination then follows its data by (1 - s) / `LEAST_SIGNAL`, and the prior by
+    the rest, as with a ridge. By chance s may exceed 1; then the data give no information on it.
 
     Args:
-        factor: of some rows.
+        factor: of rows.
         prior: of the parameters in its columns.
     """
     R = factor.triangle().numpy()

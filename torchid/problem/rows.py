@@ -195,19 +195,21 @@ class Kernels(Protocol):
 
 
 class RowBuilder(nn.Module):
-    """Rows of `W^T [K_columns | f]`: W a basis of V_x's span under which the projected sensor noise is white.
+    """Fast implementation of the fit's equations: rows of `W^T [K_columns | f]`.
 
-    The fast implementation of the equations that `torchid.Projection` computes from `torchid.Regressor` and
-    `torchid.FrameJacobian`, up to a rotation of each sample's rows, in fewer columns (see `RowColumns`). It shares
-    their functions in `torchid.regressor` and `torchid.sensing.projection`, but processes samples one contact state
-    at a time, where all shapes are constant, and multiplies W^T with the bodies' wrenches without forming K.
-    `tests/problem/test_rows_two_ways.py` compares both; read the reference implementation first.
+    W is a basis of the span of V_x (see `torchid.Projection`) that whitens the projected sensor noise. The rows equal
+    those of `torchid.Projection` applied to `torchid.Regressor` and `torchid.FrameJacobian`, up to a rotation of each
+    sample's rows, in fewer columns (see `RowColumns`). Samples are processed one contact state at a time, so all shapes
+    are constant. W^T multiplies the bodies' wrenches directly; K is never formed. Read the reference implementation
+    first; `tests/problem/test_rows_two_ways.py` compares both.
 
-    `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]. `width`:
-    number of columns, those of the bodies' parameters and one for each of `extras`. `workspaces`: of passes over rows.
-    `noise_sources`: of `noise_groups`, the group of each base row and of each measured force. `compiled`: kernels that
-    `blocks` takes its rows from, see `torchid.problem.chunks.map_chunks`; None for torch's. `task_weights`: of the
-    rows of K, (n_rows,); None for all alike.
+    Attributes:
+        frames: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m].
+        width: number of columns: those of the bodies' parameters, and one for each of `extras`.
+        workspaces: reused buffers.
+        noise_sources: group (of `noise_groups`) of each base row and each measured force.
+        compiled: compiled kernels for `blocks`, see `torchid.problem.chunks.map_chunks`; None for torch.
+        task_weights: (n_rows,), of the rows of K; None for equal weights.
     """
 
     task_weights: Tensor | None
@@ -223,7 +225,7 @@ class RowBuilder(nn.Module):
 
         Args:
             robot: the robot.
-            contacts: all contacts, by the columns of the samples' `active`.
+            contacts: all contacts, in the order of the columns of `Samples.active`.
             sensors: which forces are measured, with their noise.
             terms: extra parameters; none by default.
         """
@@ -270,13 +272,13 @@ class RowBuilder(nn.Module):
         return self.tree.ancestors.device
 
     def to_columns(self, phi: Array) -> Tensor:
-        """Parameters (M, 12 L), or (M, 12 L + E) with values of the `extras`, in these columns: (M, width)."""
+        """Convert parameters (M, 12 L), or (M, 12 L + E) with values of the `extras`, to (M, width)."""
         rigid = self.columns.parameter_map
         extra = phi[:, rigid.shape[1] :] if phi.shape[1] > rigid.shape[1] else np.zeros((len(phi), len(self.extras)))
         return torch.from_numpy(np.hstack([phi[:, : rigid.shape[1]] @ rigid.T, extra])).to(self.device)
 
     def layout(self, state: ContactState, recorded_normals: bool = False) -> ContactStateLayout:
-        """Layout of a contact state: its columns, coupled joints and, with or without recorded normals, directions."""
+        """Layout of a contact state: its columns, coupled joints and directions, with or without recorded normals."""
         return self._layouts.layout(state, recorded_normals)
 
     def layout_of(self, samples: Samples, state: ContactState) -> ContactStateLayout:
@@ -286,7 +288,7 @@ class RowBuilder(nn.Module):
     # ------------------------------------------------------------------------------------------------- kinematics
 
     def kinematics(self, samples: Samples) -> Chunk:
-        """Kinematics of some samples."""
+        """Kinematics of samples."""
         motion = samples.motion()
         joints = joint_motion(self.tree, motion)
         states = body_states(self.tree, motion, joints)
@@ -310,9 +312,9 @@ class RowBuilder(nn.Module):
         return Chunk(samples, joints, states, screw_axes, rotation, arms, axes, screw_axes[:, :0])
 
     def dynamics(self, samples: Samples, workspace: Workspace | None = None, whole: bool = False) -> Chunk:
-        """Kinematics of some samples with `wrenches`; with a workspace, valid until the next call with the same.
+        """Kinematics of samples with `wrenches`; with a workspace, valid until the next call with the same workspace.
 
-        `whole`: whether forces of inertias, which are zero, are written to it too.
+        `whole`: whether the zero forces of inertia columns are written too.
         """
         chunk = self.kinematics(samples)
         layout = self.columns.layout
@@ -324,9 +326,9 @@ class RowBuilder(nn.Module):
         return replace(chunk, wrenches=all_wrench_columns(chunk.states, layout, out))
 
     def unit_wrenches(self, chunk: Chunk, contact: int, components: Sequence[int], std: Array | None = None) -> Tensor:
-        """Wrenches at the base origin of a unit of each of a contact's components, in order, (6, k, B) [N, N m].
+        """Wrenches at the base origin, (6, k, B) [N, N m], for a unit of each of a contact's components, in order.
 
-        `std`: (6,), what to have of each component in place of a unit.
+        `std`: (6,), values to use instead of a unit.
         """
         body = self.frames[contact][0]
         arms = chunk.arms.get(contact)
@@ -348,8 +350,8 @@ class RowBuilder(nn.Module):
     def contact_jacobian(self, samples: Samples) -> Tensor:
         """Jacobians of all contacts along their frames' axes, active or not, (B, C, 6, n_rows).
 
-        Linear velocities are those of frames' origins, or of the material points where contacts roll; they are along
-        the ground's axes where its normal is what a contact is read along.
+        Linear velocities are those of the frames' origins, or of the material points where contacts roll. For scalar
+        sensors they are along the axes of the ground.
         """
         chunk = self.kinematics(samples)
         joints = range(self.tree.n_dofs)
@@ -360,7 +362,7 @@ class RowBuilder(nn.Module):
         return J
 
     def contact_rows(self, layout: ContactStateLayout, chunk: Chunk) -> ContactRows:
-        """Rows of J_C, unmeasured and measured, of the bodies that are in contact, and of loops."""
+        """Unmeasured and measured rows of J_C for the bodies in contact and for loops."""
         tree = self.tree
         unmeasured = list[tuple[Tensor, Tensor]]()
         measured = list[tuple[Tensor, Tensor]]()
@@ -408,7 +410,7 @@ class RowBuilder(nn.Module):
     # ------------------------------------------------------------------------------------------------- null spaces
 
     def null_space_bases(self, state: ContactState, chunk: Chunk) -> Iterator[tuple[Tensor | slice, Tensor]]:
-        """Orthonormal V_x, (B', base rows + coupled joints, r), with the samples it belongs to, grouped by rank."""
+        """Orthonormal V_x, (B', base rows + coupled joints, r), with the indices of the samples, grouped by rank."""
         layout = self.layout_of(chunk.samples, state)
         alike = replace(layout, row_std=torch.ones_like(layout.row_std), wrench_std=layout.wrench_std[:0])
         rows = self.contact_rows(layout, chunk)
@@ -420,13 +422,13 @@ class RowBuilder(nn.Module):
     def whitened_bases(
         self, layout: ContactStateLayout, rows: ContactRows, chunk: Chunk
     ) -> Iterator[tuple[Tensor | slice, Tensor]]:
-        """W, (base rows + coupled joints, r, B'), of contact rows with the samples it belongs to, grouped by rank.
+        """W, (base rows + coupled joints, r, B'), with the indices of the samples, grouped by rank.
 
-        Task weights D multiply the errors K phi - f: with W' the basis of unmeasured rows A_x D, W = D W' keeps them
-        out and W W^T = D W' W'^T D, so that the sum of squares is the least over all unmeasured forces x of
-        (K phi - f - A_x^T x)^T D S^-1 D (K phi - f - A_x^T x), S being the covariance of the noise.
+        Task weights D multiply the errors K phi - f. With W' the basis for the unmeasured rows A_x D, W = D W' removes
+        the unmeasured forces, and W W^T = D W' W'^T D. The sum of squares is then the least, over all unmeasured forces
+        x, of (K phi - f - A_x^T x)^T D S^-1 D (K phi - f - A_x^T x), with S the noise covariance.
 
-        Source: Mistry, Schaal, Yamane 2009, IV-E; weighted least squares under nuisance parameters.
+        Source: Mistry, Schaal, Yamane 2009, IV-E; weighted least squares with nuisance parameters.
         """
         axes = self.noise_axes(chunk.rotation, self.sensors.noise)
         order = self.tree.index(layout.blocks.order)
@@ -440,7 +442,7 @@ class RowBuilder(nn.Module):
             yield index, W * D[:, None, None]
 
     def coupled_at_rest(self, layout: ContactStateLayout, chunk: Chunk) -> Tensor | None:
-        """Which coupled joints and readings in limbs have torques that count as unmeasured, (k, B); None for none."""
+        """Coupled joints at rest, whose torque counts as unmeasured, (k, B); None without any."""
         resting = chunk.resting
         if resting is None or not layout.coupled_joints:
             return None
@@ -448,7 +450,7 @@ class RowBuilder(nn.Module):
         return torch.cat([resting, in_limbs])[self.tree.index(layout.coupled_joints)]
 
     def noise_axes(self, rotation: Tensor | None, noise: SensorNoise | None = None) -> Tensor | None:
-        """Axes of the stated noise of base rows, (B, 3, 3); None for the base's own: no attitude, or alike noise."""
+        """Axes of the stated noise of the base rows, (B, 3, 3); None for those of the base."""
         if rotation is None or not self.tree.base_rows or (noise and not noise.base_axes_differ):
             return None
         return levelled_base_axes(rotation)
@@ -489,23 +491,23 @@ class RowBuilder(nn.Module):
         return (axes.mT @ torch.stack([force, moment], dim=2)).mT.flatten(1)
 
     def recorded_torque(self, samples: Samples) -> Tensor:
-        """Recorded joint torques and wrenches in limbs, (B, n + 6 F) [N m, N], NaN where not recorded."""
+        """Recorded joint torques and limb sensor wrenches, (B, n + 6 F) [N m, N], NaN where not recorded."""
         if samples.torque is None:
             return samples.time.new_full((len(samples), self.tree.n_dofs), torch.nan)
         return samples.torque
 
     def torque_of_bodies(self, samples: Samples) -> Tensor:
-        """Recorded torques and wrenches without what known armatures and springs need, (B, n + 6 F) [N m, N]."""
+        """Recorded torques and wrenches minus the torques of known armatures and springs, (B, n + 6 F) [N m, N]."""
         torque = self.recorded_torque(samples)
         return torque if self.known_torques.none else torque - self.known_torques.of(samples)
 
     def coupled_forces(self, samples: Samples, layout: ContactStateLayout) -> Tensor:
-        """Measured torques of coupled joints after zeros for the base, (B, base rows + coupled joints) [N m, N]."""
+        """Zeros for the base, then measured torques of coupled joints, (B, base rows + coupled joints) [N m, N]."""
         torque = self.torque_of_bodies(samples)[:, self.tree.index(layout.coupled_joints)]
         return nn.functional.pad(torque, (self.tree.base_rows, 0))
 
     def coupled_forces_with_contacts(self, layout: ContactStateLayout, rows: ContactRows, chunk: Chunk) -> Tensor:
-        """The same with the measured forces of contacts."""
+        """As `coupled_forces`, with the measured forces of contacts."""
         forces = self.coupled_forces(chunk.samples, layout)
         if not layout.measured:
             return forces
@@ -520,11 +522,10 @@ class RowBuilder(nn.Module):
     def rows(
         self, samples: Samples, state: ContactState, workspace: Workspace | None = None
     ) -> Iterator[tuple[tuple[int, ...], Tensor]]:
-        """Blocks of rows for samples that share a contact state; no gradient flows through reused buffers.
+        """Blocks of rows for samples that share a contact state. No gradient flows through reused buffers.
 
         Yields:
-            (columns, rows): rows are (M, len(columns) + 1), the right-hand side last, valid until the next
-                is requested.
+            (columns, rows): rows are (M, len(columns) + 1), right-hand side last, valid until the next item.
         """
         for rows, _ in self.blocks(samples, state, workspace):
             support = rows.block.support
@@ -533,7 +534,7 @@ class RowBuilder(nn.Module):
     def blocks(
         self, samples: Samples, state: ContactState, workspace: Workspace | None = None
     ) -> Iterator[tuple[BlockRows, Tensor | slice]]:
-        """The same as `BlockRows`, with the samples that each block is of, in order."""
+        """As `rows`, as `BlockRows` with the samples of each block, in order."""
         workspace = workspace or Workspace()
         layout = self.layout_of(samples, state)
         if self.compiled is not None and (compiled := self.compiled.chunk(samples, layout, workspace)) is not None:
@@ -545,11 +546,10 @@ class RowBuilder(nn.Module):
         yield from ((rows, EVERY) for _, _, rows in self._uncoupled_rows(layout, chunk, workspace))
 
     def rows_by_sample(self, samples: Samples, state: ContactState) -> tuple[Tensor, Tensor]:
-        """The same rows sample by sample, for samples that share a contact state.
+        """As `rows`, sample by sample.
 
         Returns:
-            (B, n_rows, width + 1), `W^T [K | f]` with rows of zeros where a sample has fewer than n_rows, and W,
-            (B, n_rows, n_rows).
+            `W^T [K | f]`, (B, n_rows, width + 1), padded with rows of zeros, and W, (B, n_rows, n_rows).
         """
         layout = self.layout_of(samples, state)
         chunk = self.dynamics(samples)

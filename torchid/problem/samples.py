@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.errors import LogError, about_file
+from torchid.errors import LogError, about_file, format_count
 from torchid.logs import Log
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
@@ -21,6 +21,7 @@ from torchid.parameters import GRAVITY, WRENCH_COMPONENTS, Array
 from torchid.problem import log_joints
 from torchid.problem.log_joints import columns_in_order, joint_order, recorded_torques
 from torchid.problem.motion import (
+    FROM_PREPROCESS,
     MIN_MOTION,
     MIN_TURN_DEG,
     BaseMotion,
@@ -38,43 +39,48 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX, recorded_components
 
-_AS_MEASURED = "numbers throughout, as of a sensor that is there, or sensors without it"
+_AS_MEASURED = "a number in every sample, or sensors without this one"
+ACTIVE = "(N, C) bool, true while a contact touches the ground"
+"""What messages accept as `contact_active`."""
+
 _FAR_APART = 8  # samples per chosen one, beyond which a page holds few of these
 _JOINT_FIELDS = ("joint_position", "joint_velocity", "joint_acceleration")
 
 
 @dataclass(frozen=True)
 class Samples:
-    """N samples of one log, in the robot's joint order and the experiment's contact order.
+    """N samples of one log, in the joint order of the robot and the contact order of the experiment.
 
     Attributes:
         source: the log's file, for messages and tables.
         time: (N,) [s].
-        joint_position, joint_velocity, joint_acceleration: (N, n).
+        joint_position, joint_velocity, joint_acceleration: (N, n) [rad or m, /s, /s^2].
         base: motion of the base and, if known, its orientation; empty for a fixed base.
-        torque: (N, n + 6 F) [N m, N, N m] by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs;
-            NaN where not measured, or None.
-        wrench: (N, C, 6), NaN where not measured, or None; along world axes if `wrench_in_world`, else the frames'.
-            Moments are about the frames' origins, or about the world's if `base.position` is known.
-            Of a contact that is read along the ground's normal the force along it, in place of fz, is all.
-        active: (N, C) bool.
-        oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
+        torque: (N, n + 6 F) [N m, N, N m], in the order of the robot's `dof_names`: joint torques, then limb sensor
+            wrenches; NaN where not measured, or None.
+        wrench: (N, C, 6) [N, N m], NaN where not measured, or None; along world axes if `wrench_in_world`, else along
+            the contact frames. Moments are about the frames' origins, or about the world's origin if `base.position` is
+            known. A scalar sensor has the force along the ground's normal as fz, and nothing else.
+        active: (N, C) bool, true while a contact touches the ground.
+        oversampling: samples per independent sample of the sensor noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
-        noise_share: of that noise's variance, which is left; None for 1 / `oversampling`: no samples dropped since.
-        contact_normal: (N, C, 3), unit vectors in the world away from the ground; None for those of the contacts.
-        share: (N, C), of a constant contact reading that the filter leaves, as `Log.contact_share`; None for `active`.
-        unloaded: (N, C, 6), readings of contact sensors while the contact is in the air, NaN elsewhere, as
-            `Log.contact_unloaded`, on the CPU; None without such readings.
-        direction, stribeck: (N, n), what Coulomb and Stribeck friction go with, as in `Log`; None for the velocity's.
-        folder: where the tensors of a log larger than memory are stored; None for one in memory.
-        fold: number of the cross-validation fold of these samples, see `split_into_folds`.
-        blocks: (N, 2), fold and block of each sample; None for `fold` and block 0 of all.
-        has_force_normal: whether the log has forces along the ground's normal, which contacts may be read along.
-        motion_noise: noise of the motion, None without any.
-        pages: of files that the tensors are mapped to; None for those in memory.
-        payload: (12 L,), what the robot carried beside its own parameters, see `payload_parameters`; None for nothing.
-        resting: (N, n) bool, joints whose torque counts as unmeasured, as they rest (`Log.joint_rests`); None for none.
-        slope: (N, n), change of the joint torques by a further unknown of a search; None otherwise.
+        noise_share: fraction of the noise variance that the filter keeps; None for 1 / `oversampling`.
+        contact_normal: (N, C, 3), unit vectors in the world away from the ground; None for the contacts' own.
+        share: (N, C), fraction of a constant contact reading that the filter keeps, see `Log.contact_share`; None for
+            `active`.
+        unloaded: (N, C, 6), readings of contact sensors in the air, NaN elsewhere, see `Log.contact_unloaded`, on the
+            CPU; or None.
+        direction, stribeck: (N, n), factors of Coulomb and Stribeck friction, see `Log`; None to compute them from the
+            velocity.
+        folder: where the tensors of a log larger than memory are stored; None for a log in memory.
+        fold: number of the cross-validation fold, see `split_into_folds`.
+        blocks: (N, 2), fold and block of each sample; None for `fold` and block 0.
+        has_force_normal: whether the log has forces along the ground's normal.
+        motion_noise: noise of the motion, or None.
+        pages: pages of the files that the tensors are mapped to; None for tensors in memory.
+        payload: (12 L,), parameters of a payload, see `payload_parameters`; or None.
+        resting: (N, n) bool, joints at rest, whose torque counts as unmeasured (`Log.joint_rests`); or None.
+        slope: (N, n), change of the joint torques per unit of the unknown of a search; or None.
     """
 
     source: str
@@ -124,7 +130,7 @@ class Samples:
         return replace(self, base=self.base.map(change), **changed)
 
     def __getitem__(self, index: slice | Tensor) -> Samples:
-        """Some of the samples; of mapped ones far apart, one tensor's pages are in memory at a time."""
+        """Select samples. For memory-mapped samples far apart, only the pages of one tensor at a time are in memory."""
         pages = self.pages
         if pages is None or not _is_far_apart(index):
             return self._each(lambda x: x[index])
@@ -138,27 +144,27 @@ class Samples:
 
     @property
     def noise_left(self) -> float:
-        """Share of the variance of the recorded noise that is in the samples."""
+        """Fraction of the variance of the recorded noise that is in the samples."""
         return 1.0 / self.oversampling if self.noise_share is None else min(self.noise_share, 1.0)
 
     def pieces(self) -> list[Samples]:
-        """The samples, in pieces that are small beside those of a log larger than memory."""
+        """Cut the samples into pieces that fit in memory."""
         return [self[start : start + 2**16] for start in range(0, len(self), 2**16)]
 
     def every(self, step: int) -> Samples:
-        """Every `step`-th sample from the first on; all of them, without a copy, for a step of 1."""
+        """Every `step`-th sample, beginning with the first; a step of 1 makes no copy."""
         return self if step == 1 else self[::step]
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Samples:
-        """The samples on another device, all but readings in the air, which become a few means, and `blocks`."""
+        """Move the samples to another device, except `blocks` and readings in the air, which become a few means."""
         return self._each_that_moves(lambda x: x.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> Samples:
-        """The samples with page-locked copies of what `to` moves, which a GPU can read while the host goes on."""
+        """Copy to page-locked memory what `to` moves, so that a GPU can read it asynchronously."""
         return self._each_that_moves(torch.Tensor.pin_memory)
 
     def keep_for(self, stream: torch.Stream) -> None:
-        """Keep the memory of what `to` has moved until a stream of the device has done what it was given so far."""
+        """Keep the memory that `to` moved until a stream of the device has finished its queued work."""
 
         def kept(x: Tensor) -> Tensor:
             x.record_stream(stream)
@@ -184,7 +190,7 @@ class Samples:
         return Motion(*joints, omega, alpha, force, self.direction)
 
     def perturbed(self, noise: MotionNoise, size: Tensor) -> Samples:
-        """The samples with as much noise of the motion again, times a `size`, (B, 1), see `MotionNoise.drawn`."""
+        """Add motion noise of the same size again, times `size`, (B, 1), see `MotionNoise.drawn`."""
         (q, v, a), of_base = noise.drawn(self.time, size)
         return replace(
             self,
@@ -195,7 +201,7 @@ class Samples:
         )
 
     def with_noise_alone(self, noise: SensorNoise) -> Samples:
-        """The samples with readings that are noise of the forces alone, drawn as that of the motion is."""
+        """Replace the readings by pure force noise, drawn like the motion noise."""
         torque = self.torque
         wrench = self.wrench
         if torque is not None:
@@ -207,11 +213,10 @@ class Samples:
         return replace(self, torque=torque, wrench=wrench)
 
     def coordinates(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Generalized coordinates q (N, n + 7), v and a (N, nv) as `Regressor` takes them.
+        """Generalized coordinates q (N, n + 7), v and a (N, nv), as `Regressor` takes them.
 
-        Base position and base linear velocity are 0: the dynamics do not depend on them, and logs need not have them.
-        An orientation that was not measured is the identity: given the specific force, the dynamics do not depend on it
-        either. A fixed base has joints only.
+        Base position and base linear velocity are 0, because the dynamics do not depend on them. A missing orientation
+        is the identity, because the specific force is given. A fixed base has joints only.
         """
         q = self.joint_position
         v = self.joint_velocity
@@ -254,14 +259,14 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
     """Order a preprocessed log by the robot's joints and the contacts, and check it.
 
     Args:
-        log: with velocities and accelerations filled in (see `torchid.logs.preprocess`).
+        log: with velocities and accelerations (see `torchid.preprocess`).
         robot: the robot.
         contacts: the contacts in use.
-        required: sensors whose values must all have been recorded; None if gaps are allowed.
+        required: sensors that must have a value in every sample; None to allow gaps.
 
     Raises:
-        UnknownNameError: a joint or contact that the robot does not have.
-        LogError: a missing joint, contact, motion or force.
+        UnknownNameError: the robot has no such joint or contact frame.
+        LogError: a joint, contact, motion or force is missing.
     """
     log = _with_writable_arrays(log)
     order = joint_order(log, robot)
@@ -271,7 +276,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
     chosen, active = _contacts(log, robot, contacts)
     if log.contact_wrench_world is not None and contacts and base.quat_xyzw is None and not robot.fixed_base:
         accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or contact_wrench_local"
-        raise LogError(log.source, "contact_wrench_world", "given without the base's orientation", accepted)
+        raise LogError(log.source, "contact_wrench_world", "needs the base's orientation, which is missing", accepted)
     normals = _contact_normals(log, robot, contacts, base, chosen, active)
     wrench = _wrenches(log, contacts, chosen)
     if wrench is not None and base.position is not None:  # whatever is not known of a force is not of a moment either
@@ -322,8 +327,8 @@ def _contact_normals(
         return None
     if base.quat_xyzw is None and not robot.fixed_base:
         first = grounded[0]
-        does = f"radius {first.radius:g} m) rolls" if first.radius else f"sensor {NORMAL_FORCE}) stands"
-        reason = f"missing, though {first.frame} ({does} on ground that is known in the world"
+        needs = f"radius {first.radius:g} m" if first.radius else f"sensor {NORMAL_FORCE}"
+        reason = f"missing, but {first.frame} ({needs}) needs the ground's normal in the base frame"
         otherwise = "radius: 0 for this contact" if first.radius else f"sensors without {NORMAL_FORCE}"
         accepted = f"base_quat_wxyz or base_quat_xyzw beside the IMU, or {otherwise}"
         raise LogError(log.source, "base_quat_xyzw", reason, accepted)
@@ -371,15 +376,15 @@ def oversampling(time: FloatArray, noise_bandwidth_hz: float | None) -> float:
 def _joints(log: Log, name: str, order: list[int]) -> Tensor:
     values = getattr(log, name)
     if values is None:
-        raise LogError(log.source, name, "missing", "the field, or a log passed through preprocess()")
+        raise LogError(log.source, name, "missing", FROM_PREPROCESS)
     return torch.from_numpy(columns_in_order(values, order))
 
 
 def require_contacts(source: str, names: Sequence[str], contacts: Sequence[Contact]) -> None:
-    """Refuse a log without some of these contacts. Raises LogError: names the first one missing."""
+    """Raise LogError if a contact is missing in a log; the message names the first one."""
     missing = next((contact.frame for contact in contacts if contact.frame not in names), None)
     if missing is not None:
-        raise LogError(source, "contact_names", f"contact '{missing}' missing", "every contact of the experiment")
+        raise LogError(source, "contact_names", f"contact '{missing}' missing", "all contacts of the experiment")
 
 
 def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list[int], np.ndarray]:
@@ -389,12 +394,12 @@ def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list
         with about_file(log.source):
             robot.link(name, "contact_names")
         if name not in frames and log.contact_active is not None and log.contact_active[:, column].any():
-            raise LogError(log.source, f"contact_names '{name}'", "active, but not among the experiment's contacts",
-                           f"contacts: [{{frame: {name}, type: ...}}, ...]")  # fmt: skip
+            raise LogError(log.source, f"contact_names '{name}'", "active, but not a contact of the experiment",
+                           f"{{frame: {name}, type: ...}} in contacts")  # fmt: skip
     require_contacts(log.source, log.contact_names, contacts)
     order = [log.contact_names.index(frame) for frame in frames]
     if frames and log.contact_active is None:
-        raise LogError(log.source, "contact_active", "missing", "(N, C) bool: which contact touches the ground when")
+        raise LogError(log.source, "contact_active", "missing", ACTIVE)
     if log.contact_active is None:
         return order, np.zeros((len(log), 0), dtype=bool)
     return order, columns_in_order(log.contact_active, order)
@@ -414,7 +419,7 @@ def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], 
         bad = ~torch.isfinite(samples.torque) & torch.from_numpy(required.torque)
         if bad.any():
             sample, dof = torch.nonzero(bad)[0].tolist()
-            reason = f"not a finite number at sample {sample} ({int(bad[:, dof].sum())} in all)"
+            reason = f"not a finite number at sample {sample} (in {format_count(int(bad[:, dof].sum()), 'sample')})"
             reason = "NaN in all samples of the fit" if bad[:, dof].all() else reason
             field = "ft_wrench" if dof >= robot.n else "joint_torque"
             raise LogError(samples.source, f"{field} '{robot.dof_names[dof]}'", reason, _AS_MEASURED)
@@ -423,14 +428,14 @@ def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], 
         if samples.wrench is None:
             accepted = "contact_wrench_local or contact_wrench_world"
             if samples.has_force_normal:
-                accepted += f", or contact_wrenches: {{FRAME: [{NORMAL_FORCE}]}} for the log's {FORCE_NORMAL}"
+                accepted += f", or sensors.contact_wrenches: {{FRAME: [{NORMAL_FORCE}]}} to use {FORCE_NORMAL}"
             raise LogError(samples.source, "contact_wrench", "missing", accepted)
         bad = ~torch.isfinite(samples.wrench) & torch.from_numpy(needed) & samples.active[..., None]
         if bad.any():
             sample, contact, k = torch.nonzero(bad)[0].tolist()
             if contacts[contact].along_normal:
                 raise _scalar_error(samples, contacts[contact].frame, sample, k)
-            reason = f"{WRENCH_COMPONENTS[k]} is not a finite number at sample {sample}, while in contact"
+            reason = f"{WRENCH_COMPONENTS[k]} is not a finite number at sample {sample}, during contact"
             field = f"contact_wrench '{contacts[contact].frame}'"
             raise LogError(samples.source, field, reason, _AS_MEASURED)
 
@@ -439,11 +444,11 @@ def _scalar_error(samples: Samples, frame: str, sample: int, k: int) -> LogError
     """What is missing of a contact that is read along the ground's normal."""
     field = f"{FORCE_NORMAL} '{frame}'"
     if k != NORMAL_INDEX:
-        reason = f"no {WRENCH_COMPONENTS[k]}: the contact is read along the ground's normal"
-        return LogError(samples.source, field, reason, f"contact_wrenches: {{{frame}: [{NORMAL_FORCE}]}}")
+        reason = f"{WRENCH_COMPONENTS[k]} is not measured, only the force along the ground's normal"
+        return LogError(samples.source, field, reason, f"sensors.contact_wrenches: {{{frame}: [{NORMAL_FORCE}]}}")
     if not samples.has_force_normal:
         return LogError(samples.source, field, "missing", f"the field, or sensors without {NORMAL_FORCE}")
-    reason = f"not a finite number at sample {sample}, while in contact"
+    reason = f"not a finite number at sample {sample}, during contact"
     return LogError(samples.source, field, reason, _AS_MEASURED)
 
 

@@ -1,4 +1,4 @@
-"""What contact sensors read in the air: their offsets, as equations of a fit or taken off before it."""
+"""Offsets of contact sensors from their readings in the air, as equations of a fit or subtracted before it."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ _OUTLYING = 4.0  # standard deviations; of Gaussian readings 6e-5 are dropped
 
 @dataclass(frozen=True)
 class UnloadedOffsetEquation:
-    """The equation for a contact sensor's unknown offset from its readings while the contact is in the air.
+    """Equation for the unknown offset of a contact sensor, from its readings in the air.
 
-    The sensor then reads its offset and the weight of the parts beyond it.
+    In the air the sensor measures its offset and the weight of the parts beyond it.
 
     Attributes:
         offset: its number among the extras.
-        scale: number of the channel's unknown scale, None if that is known.
-        masked: whether the readings are masked, clamped or missing (exactly 0), so that there is no equation.
+        scale: number of the channel's unknown scale; None if the scale is known.
+        masked: whether the readings are masked, clamped or missing (exactly 0); there is no equation then.
         mean: of the readings, without outliers [N, N m].
         deviation: standard deviation of the mean [N, N m]: that of independent readings with the stated noise, or more
-            if they or their means over longer spans of time scatter more.
+            if the readings, or their means over longer times, vary more.
     """
 
     offset: int
@@ -54,8 +54,8 @@ class UnloadedOffsetEquation:
     def row(self, builder: RowBuilder) -> tuple[tuple[int, ...], Tensor]:
         """The whitened equation `o - (s - 1) mean = mean` as a block of one row: its columns, and (1, columns + 1).
 
-        The scale's column holds the mean: the noise of single readings would bias the scale towards 0. The row is on
-        the CPU, where readings in the air are, and so is the block of such rows in a factor.
+        The scale's column has the mean, because the noise of single readings would bias the scale towards 0. The row is
+        on the CPU, like the readings in the air.
         """
         first = builder.columns.count
         row = [1.0, self.mean]
@@ -88,7 +88,7 @@ def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator
 
 
 def _are_masked(count: ArrayLike, above: ArrayLike, below: ArrayLike) -> NDArray[np.bool_]:
-    """Whether readings in the air are masked or clamped, not measured: many are exactly 0, and few of one sign."""
+    """Whether readings in the air are masked or clamped: many are exactly 0, and few have one of the signs."""
     zero = np.subtract(np.subtract(count, above), below)
     return (zero > np.multiply(_MASKED_SHARE, count)) & (np.minimum(above, below) < np.multiply(_ONE_SIDED, count))
 
@@ -103,34 +103,34 @@ def _robust_mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, f
 
 
 _KEY = "preprocessing.zero_in_air"
-_FITTED = "sensors.offsets: {contact_force: log, contact_moment: log}, which are fitted"
+_FITTED = "sensors.offsets: {contact_force: log, contact_moment: log}"
 
 
 def zero_in_air(log: Log, contacts: Sequence[Contact]) -> Log:
-    """The log, of whose contact sensors the mean of what each channel reads in the air is subtracted.
+    """Subtract from each contact sensor channel the mean of its readings in the air.
 
-    In the air is further than `UNLOADED_MARGIN_S` from every sample in which the contact touches by its flag. Wrenches
-    along the world's axes are those of force plates, which do not move in it, and have moments about its origin.
+    In the air means more than `UNLOADED_MARGIN_S` from every sample in which the contact flag is set. Wrenches along
+    world axes must be those of force plates, which do not move and have moments about the world's origin.
 
     Args:
         log: as recorded, with flags.
-        contacts: whose sensors are zeroed; an unmeasured one is left out.
+        contacts: sensors to zero; unmeasured ones are ignored.
 
     Raises:
-        LogError: no readings of contacts, or along the world's axes of sensors that move; fewer than `LEAST_READINGS`
-            in the air of a channel that has others.
+        LogError: the log has no contact readings, readings along world axes of moving sensors, or a channel with fewer
+            than `LEAST_READINGS` readings in the air.
 
     Warns:
-        TorchidWarning: what was subtracted, by contact; channels that are masked in the air.
+        TorchidWarning: the subtracted offsets; channels that are masked in the air.
     """
     wrench = log.contact_wrench
     scalar = log.contact_force_normal
     if log.contact_wrench_world is not None and not log.moments_about_world_origin:
-        reason = f"given with {_KEY}, though no offset is constant along the world's axes of a sensor that moves"
-        accepted = f"{WRENCHES[0]} or {FORCE_NORMAL}; of force plates {POINTS}, or logs.columns.plates"
+        reason = f"{_KEY} needs wrenches in the sensor's frame: along world axes a moving sensor has no constant offset"
+        accepted = f"{WRENCHES[0]} or {FORCE_NORMAL}; for force plates {POINTS} or logs.columns.plates"
         raise LogError(log.source, WRENCHES[1], reason, accepted)
     if wrench is None and scalar is None:
-        raise LogError(log.source, WRENCHES[0], "missing", f"readings of contacts, which {_KEY} is for")
+        raise LogError(log.source, WRENCHES[0], "missing", f"contact readings for {_KEY}")
     count = len(log.contact_names)
     six = np.zeros((len(log), count, 6)) if wrench is None else wrench
     along = np.zeros((len(log), count)) if scalar is None else scalar
@@ -157,15 +157,15 @@ def zero_in_air(log: Log, contacts: Sequence[Contact]) -> Log:
 
 
 def _require_readings(log: Log, frame: str, component: int, count: int) -> None:
-    """Refuse a channel that was read less often in the air than a mean needs."""
+    """Raise LogError if a channel has too few readings in the air for a mean."""
     if count < LEAST_READINGS:
-        reason = f"{count} readings of {frame} in the air, more than {UNLOADED_MARGIN_S:g} s from contact"
-        accepted = f"{LEAST_READINGS} or more for {_KEY}, or {_FITTED}"
+        reason = f"{count} readings of {frame} in the air (more than {UNLOADED_MARGIN_S:g} s from contact)"
+        accepted = f"at least {LEAST_READINGS} for {_KEY}, or fit the offset: {_FITTED}"
         raise LogError(log.source, FORCE_NORMAL if component == 6 else log.contact_wrench_field, reason, accepted)
 
 
 def _warn_of_offsets(log: Log, offsets: FloatArray, masked: Sequence[str]) -> None:
-    """Warn of offsets (C, 7) that were subtracted, and of contacts whose readings are masked."""
+    """Warn about subtracted offsets (C, 7), and about contacts with masked readings."""
     units = ((slice(0, 3), "N"), (slice(3, 6), "N m"), (slice(6, 7), "N along the normal"))
     texts = [
         f"{name} {', '.join(f'{x:.3g}' for x in offset[part])} {unit}"
@@ -174,7 +174,7 @@ def _warn_of_offsets(log: Log, offsets: FloatArray, masked: Sequence[str]) -> No
         if offset[part].any()
     ]
     if texts:
-        warn(f"{log.source}: {_KEY} has subtracted {'; '.join(texts)}")
+        warn(f"{log.source}: {_KEY} subtracted these offsets: {'; '.join(texts)}")
     if masked:
-        text = f"readings of {', '.join(masked)} in the air are 0 or clamped and show no offset"
-        warn(f"{log.source}: {_KEY}: {text}; {_FITTED}, may find it")
+        text = f"readings of {', '.join(masked)} in the air are 0 or clamped, so {_KEY} finds no offset"
+        warn(f"{log.source}: {text}. To fit it, set {_FITTED}")

@@ -17,14 +17,14 @@ GRAVITY_WORLD = (0.0, 0.0, -GRAVITY)
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of B samples, batch first. K depends on nothing else: not on the base's position or heading.
+    """Motion of B samples: all that the regressor K depends on. Base position and heading are not needed.
 
     Attributes:
-        joint_position, joint_velocity, joint_acceleration: (B, n) by the robot's `joint_names` [rad or m, /s, /s^2].
+        joint_position, joint_velocity, joint_acceleration: (B, n), in the order of `joint_names` [rad or m, /s, /s^2].
         base_angular_velocity, base_angular_acceleration: (B, 3) in the base frame [rad/s, rad/s^2].
-        base_specific_force: (B, 3), acceleration of the base origin minus gravity, in the base frame [m/s^2]; what an
-            ideal accelerometer there reads.
-        joint_direction: (B, n), what Coulomb friction goes with; None for the sign of the velocity.
+        base_specific_force: (B, 3), acceleration of the base origin minus gravity, in the base frame [m/s^2]. An ideal
+            accelerometer at the base origin measures it.
+        joint_direction: (B, n), the factor of Coulomb friction; None for the sign of the velocity.
     """
 
     joint_position: Tensor
@@ -42,7 +42,7 @@ class Motion:
         return self._each(lambda x: x[index])
 
     def to(self, *args: Any, **kwargs: Any) -> Motion:
-        """As `torch.Tensor.to`, for every part."""
+        """Move or convert all tensors, as `torch.Tensor.to` does."""
         return self._each(lambda x: x.to(*args, **kwargs))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Motion:
@@ -57,20 +57,20 @@ def motion_from_state(
     fixed_base: bool = False,
     gravity: tuple[float, float, float] = GRAVITY_WORLD,
 ) -> Motion:
-    """Motion from generalized coordinates in Pinocchio's free-flyer layout.
+    """Compute the motion from generalized coordinates in Pinocchio's free-flyer layout.
 
     Args:
-        q: (B, 7 + n): base position in the world (3) [m], orientation as a quaternion x, y, z, w, which is
-            normalized (norm 0 is no turn), joints; (B, n) for a fixed base.
-        v: (B, nv): base linear and angular velocity in the base frame, then joints.
-        a: (B, nv): d/dt of `v`.
+        q: (B, 7 + n): base position in the world [m], base orientation as a quaternion x, y, z, w, joint positions
+            [rad or m]; (B, n) for a fixed base. The quaternion is normalized; norm 0 means no rotation.
+        v: (B, nv): base linear and angular velocity in the base frame [m/s, rad/s], then joint velocities.
+        a: (B, nv): time derivative of `v`.
         n: number of independent joints.
-        fixed_base: whether the base is fixed, with its axes those of the world.
+        fixed_base: whether the base is fixed, with the axes of the world.
         gravity: (3,), in the world [m/s^2].
 
     Raises:
-        TypeError: one of `q`, `v` and `a` is not a tensor, or on another device.
-        ValueError: wrong shapes of these.
+        TypeError: `q`, `v` or `a` is not a tensor, or they are on different devices.
+        ValueError: a shape is wrong.
     """
     if wrong := [type(x).__name__ for x in (q, v, a) if not isinstance(x, Tensor)]:
         raise TypeError(f"q, v, a: found {wrong[0]}; accepted: tensors")
@@ -93,9 +93,9 @@ def motion_from_state(
 
 @dataclass(frozen=True)
 class JointMotion:
-    """Positions, velocities, accelerations of the base's and all L - 1 joints, (L, B); the base's row is 0.
+    """Positions, velocities, accelerations of all joints, (L, B); row 0 belongs to the base and is 0.
 
-    `direction`, (L, B): what Coulomb friction goes with.
+    `direction`, (L, B): the factor of Coulomb friction.
     """
 
     position: Tensor
@@ -144,8 +144,8 @@ class BodyStates:
 def body_states(tree: KinematicTree, motion: Motion, joints: JointMotion) -> BodyStates:
     """States of all joint frames.
 
-    Twists and accelerations are sums over ancestors of what each joint adds (`..._joint`), with one product each by the
-    0/1 ancestor matrix.
+    Each joint adds a part (`..._joint`) to the twists and accelerations of its descendants. A product with the 0/1
+    ancestor matrix sums these parts.
     """
     rotation, position = joint_frame_poses(tree, joints.position)
     axis = rotation[:, 2]
@@ -172,26 +172,21 @@ def body_states(tree: KinematicTree, motion: Motion, joints: JointMotion) -> Bod
 
 
 def require_precision(tree: KinematicTree, tensors: Mapping[str, Tensor | None]) -> None:
-    """Refuse tensors, by name, of another precision or device than the module's.
-
-    Raises:
-        TypeError: there is one.
-    """
+    """Raise TypeError if a tensor has another dtype or device than the module."""
     for name, x in tensors.items():
         for what in ("dtype", "device"):
             expected = getattr(tree.joint_map, what)
             if isinstance(x, Tensor) and (actual := getattr(x, what)) != expected:
-                raise TypeError(
-                    f"{name}: found {actual}; accepted: {expected}, the module's, which .to({what}) changes"
-                )
+                accepted = f"{expected} (the module's {what}); convert {name}, or the module with .to({actual})"
+                raise TypeError(f"{name}: found {actual}; accepted: {accepted}")
 
 
 def independent_positions(tree: KinematicTree, q: Tensor) -> Tensor:
     """Positions (B, n) of the independent joints in coordinates (B, n + 7), or (B, n) for a fixed base.
 
     Raises:
-        TypeError: `q` is not a tensor, or of another precision than the module.
-        ValueError: another shape.
+        TypeError: `q` is not a tensor, or has another dtype or device than the module.
+        ValueError: the shape is wrong.
     """
     width = tree.n + (7 if tree.base_rows else 0)
     if not isinstance(q, Tensor):
@@ -257,9 +252,9 @@ def joint_screw_axes(tree: KinematicTree, states: BodyStates) -> Tensor:
 
 
 def rotation_matrix(quat_xyzw: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any norm, scalar last; norm 0 is no turn.
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any norm, scalar last; norm 0 means no rotation.
 
-    No value is looked at, for which a GPU would have to wait.
+    No branch depends on a value, so a GPU need not synchronize.
     """
     x, y, z, w = quat_xyzw.unbind(-1)
     square = x * x + y * y + z * z + w * w
@@ -282,15 +277,15 @@ def cross_product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def rotate_vectors(rotation: Tensor, x: Tensor | Sequence[Tensor], out: Tensor | None = None) -> Tensor:
-    """Rotation (3, 3, ...) times vectors (3, ...), to `out`, if given, which no gradient flows through."""
+    """Rotation (3, 3, ...) times vectors (3, ...), written to `out` if given (no gradient flows through `out`)."""
     return torch.mul(rotation[:, 0], x[0], out=out).addcmul_(rotation[:, 1], x[1]).addcmul_(rotation[:, 2], x[2])
 
 
 def frame_acceleration(states: BodyStates, body: int, T_joint_frame: Tensor, arms: Tensor | None = None) -> Tensor:
     """Acceleration of a frame's origin and angular acceleration, in the base's axes, (3, 2, B), without gravity.
 
-    With arms, (3, 3, B), where it rolls: d/dt (v + omega x l), of the arm l whose direction the ground fixes. It is not
-    the acceleration of the material point, whose arm turns with the body.
+    With `arms`, (3, 3, B), of a rolling contact: d/dt (v + omega x l) for an arm l whose direction the ground fixes.
+    This is not the acceleration of the material point, because the arm of that point rotates with the body.
     """
     arm = (states.rotation[:, :, body] * T_joint_frame[:3, 3, None]).sum(1)
     omega = states.angular_velocity[:, body]

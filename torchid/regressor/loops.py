@@ -1,4 +1,4 @@
-"""Closed loops: how far their frames are apart, and the generalized forces of what they exert, batch-last."""
+"""Closed loops: the gaps between their frames, and the generalized forces of loop forces, batch-last."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from torchid.regressor.tree import KinematicTree
 from torchid.robot import Loop, Robot
 from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
 
-_POSTURES = 16  # random ones, from which constant directions without work are told
+_POSTURES = 16  # random ones, to find the constant directions that do no work
 _LARGEST = 1.5  # rad or m, of their joint positions
 _CLOSED = 1e-12  # m or rad: a gap that is rounding
 _STANDS = 1e-10  # rad or m: after a smaller step, the next of Gauss-Newton is rounding
@@ -253,32 +253,29 @@ class LoopClosures:
 
 
 class LoopJacobian(nn.Module):
-    """Jacobian of a robot's loops: `J(q) v` are the twists of their first frames relative to the second.
+    """Jacobian of a robot's closed loops: `J(q) v` is the twist of each loop's first frame relative to its second.
 
-    At the first frame's origin, along its axes: three rows of a point, six of a weld, loop by loop. What the loops
-    exert enters the dynamics as `J^T f`, as contacts do, and is not measured: rows for `torchid.Projection` after those
-    of J_C, which are always active. The base's columns are 0: forces inside of the robot do not move it.
+    The twist is taken at the first frame's origin, along its axes: three rows for a point, six for a weld. Loop forces
+    enter the dynamics as `J^T f`, like unmeasured contacts that are always active: append the rows to J_C for
+    `torchid.Projection`. The columns of the base are 0, because internal forces do not move the base.
     """
 
     def __init__(self, robot: Robot) -> None:
         """Build the constants.
 
         Args:
-            robot: with its loops; without any, there are no rows.
+            robot: with its loops; without loops J has no rows.
         """
         super().__init__()
         self.closures = LoopClosures(robot)
         self.tree = self.closures.tree
 
     def forward(self, q: Tensor) -> Tensor:
-        """Jacobian at coordinates, (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
-
-        Returns:
-            (B, k, n_rows).
+        """Compute the Jacobian, (B, k, n_rows), at `q`, (B, n + 7), or (B, n) for a fixed base (see `Regressor`).
 
         Raises:
-            TypeError: `q` is not a tensor, or of another precision than the module.
-            ValueError: wrong shape of `q`.
+            TypeError: `q` is not a tensor, or has another dtype or device than the module.
+            ValueError: the shape of `q` is wrong.
         """
         joint_position = independent_positions(self.tree, q)
         return nn.functional.pad(self.closures.jacobian(joint_position), (self.tree.base_rows, 0))

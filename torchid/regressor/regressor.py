@@ -33,16 +33,15 @@ from torchid.robot import Robot
 
 
 class Regressor(nn.Module):
-    """K(q, v, a) with `K phi = S^T tau + J_C^T lambda` (Mistry et al. 2009, eq. 5).
+    """Regressor K(q, v, a) with `K phi = S^T tau + J_C^T lambda` (Mistry et al. 2009, eq. 5).
 
-    Differentiable; moved by `.to(device, dtype)`; one graph to `torch.compile` and `torch.export`. Columns: 12 a body,
-    bodies in `robot.body_names`' order, parameters in `torchid.parameters`' order. Rows: base force, base moment (base
-    frame, about the base origin), then `robot.dof_names`: joints, and the wrenches of force/torque sensors in limbs; a
-    fixed base has no base rows.
+    Columns: 12 per body, bodies in the order of `robot.body_names`, parameters in the order of `torchid.parameters`.
+    Rows: base force and base moment (base frame, about the base origin), then `robot.dof_names`: joint torques and
+    wrenches of limb force/torque sensors. A fixed base has no base rows.
 
-    With `FrameJacobian` and `torchid.Projection`, the reference implementation of the equations of a fit. Fits use
-    `torchid.RowBuilder`, which shares the functions of this package but never forms K, for speed
-    (`tests/problem/test_rows_two_ways.py` compares both).
+    The module is differentiable, `.to(device, dtype)` moves it, and `torch.compile` and `torch.export` trace it as one
+    graph. `Regressor`, `FrameJacobian` and `torchid.Projection` are the reference implementation. Fits use the faster
+    `torchid.RowBuilder`, which never forms K (`tests/problem/test_rows_two_ways.py` compares both).
     """
 
     def __init__(
@@ -53,7 +52,7 @@ class Regressor(nn.Module):
         Args:
             robot: the robot.
             gravity: (3,), in the world (in the base frame if the base is fixed) [m/s^2].
-            sign_width: Coulomb friction is tanh(velocity / width) instead of the sign [rad/s or m/s].
+            sign_width: replaces the sign of Coulomb friction by tanh(velocity / sign_width) [rad/s or m/s].
         """
         super().__init__()
         self.gravity = gravity
@@ -63,27 +62,27 @@ class Regressor(nn.Module):
         self._rows = joint_rows(self.tree, self._columns)
 
     def forward(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """Regressor at generalized coordinates.
+        """Compute the regressor at generalized coordinates.
 
         Args:
-            q: (B, n + 7), base position [m], orientation x y z w, which is normalized (norm 0 is no turn), joints
-                [rad or m]; (B, n) for a fixed base.
-            v: (B, nv), base linear and angular velocity in the base frame, joints.
-            a: (B, nv), d/dt of `v`.
+            q: (B, n + 7): base position [m], base quaternion x, y, z, w (it is normalized; norm 0 means no rotation),
+                joint positions [rad or m]; (B, n) for a fixed base.
+            v: (B, nv): base linear and angular velocity in the base frame [m/s, rad/s], joint velocities.
+            a: (B, nv): time derivative of `v`.
 
         Returns:
-            (B, nv + 6 F, 12 L) for F force/torque sensors in limbs, a strided view of a batch-last tensor: call
-            `.contiguous()` where layout matters.
+            (B, nv + 6 F, 12 L) for L bodies and F limb force/torque sensors. It is a strided view of a batch-last
+            tensor; call `.contiguous()` if the memory layout matters.
 
         Raises:
-            TypeError: one that is not a tensor, or of another precision or device than the module.
-            ValueError: wrong shapes.
+            TypeError: an argument is not a tensor, or has another dtype or device than the module.
+            ValueError: a shape is wrong.
         """
         require_precision(self.tree, {"q": q, "v": v, "a": a})
         return self.from_motion(motion_from_state(q, v, a, self.tree.n, not self.tree.base_rows, self.gravity))
 
     def from_motion(self, motion: Motion) -> Tensor:
-        """As `forward`, from a `Motion` (which has no base position, heading or linear velocity)."""
+        """Compute the regressor, (B, nv + 6 F, 12 L), from a `Motion`."""
         tree = self.tree
         columns = self._columns
         joints = joint_motion(tree, motion)
@@ -148,7 +147,7 @@ def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, screw_ax
 def friction_columns(row: JointRow, joints: JointMotion) -> list[tuple[int, Tensor, Tensor]]:
     """Friction entries of one joint's row: body, column of fc, column of fv, each (B,).
 
-    Friction adds `fc sign(v) + fv v` to the actuator's torque, in a filtered log what the filter makes of it.
+    Friction adds `fc sign(v) + fv v` to the actuator's torque. In a filtered log this term is filtered too.
     """
     entries = []
     for body, ratio in row.moved:
@@ -271,10 +270,9 @@ def contact_arms(
 class FrameJacobian(nn.Module):
     """Jacobian of a URDF frame: `J(q) v` is the twist of its origin in its own axes, linear velocity first.
 
-    With a radius the linear velocity is that of the material point at c - radius n of a sphere about the origin c, or,
-    with `axis`, of a cylinder about that axis of the frame, whose velocity along the axis is that of c (see
-    `torchid.Contact`): what the ground does not let move where the foot rolls. `J^T` takes the ground's wrench as read
-    at c.
+    With a radius, the frame rolls on the ground as a sphere about its origin c, or as a cylinder about `axis` (see
+    `torchid.Contact`). The linear velocity is then that of the material point at c - radius n on the ground;
+    along a cylinder's axis it is that of c. `J^T` maps the wrench of the ground, measured at c.
     """
 
     def __init__(
@@ -291,11 +289,11 @@ class FrameJacobian(nn.Module):
             robot: the robot.
             frame: name of a URDF link.
             radius: of the sphere or cylinder [m].
-            axis: x, y or z, along which the cylinder is; None for a sphere.
+            axis: x, y or z, the cylinder's axis; None for a sphere.
             centre: c in the frame, (3,) [m].
 
         Raises:
-            UnknownNameError: the URDF has no such link.
+            UnknownNameError: the robot has no such link.
         """
         super().__init__()
         self.tree = KinematicTree(robot)
@@ -307,20 +305,19 @@ class FrameJacobian(nn.Module):
         self.axis = axis
 
     def forward(self, q: Tensor, normal: Tensor | None = None) -> Tensor:
-        """Jacobian at coordinates.
+        """Compute the Jacobian.
 
         Args:
-            q: (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
-            normal: of the ground where the frame rolls, (B, 3) or (3,), unit vectors in the world (a fixed base's
-                frame); None for z.
+            q: (B, n + 7), or (B, n) for a fixed base (see `Regressor`).
+            normal: of the ground under a rolling frame, (B, 3) or (3,), unit vectors in the world (in the base frame if
+                the base is fixed); None for z.
 
         Returns:
-            (B, 6, n_rows). n_rows = nv + 6 F: force/torque sensors in limbs add six columns each, after those of the
-            joints.
+            (B, 6, n_rows) with n_rows = nv + 6 F: each of F limb force/torque sensors adds six columns at the end.
 
         Raises:
-            TypeError: `q` is not a tensor, or of another precision than the module.
-            ValueError: wrong shape of `q`.
+            TypeError: `q` is not a tensor, or has another dtype or device than the module.
+            ValueError: the shape of `q` is wrong.
         """
         tree = self.tree
         states = states_at_rest(tree, independent_positions(tree, q))

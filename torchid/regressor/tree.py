@@ -112,7 +112,7 @@ class KinematicTree(nn.Module):
     def __init__(self, robot: Robot, sign_width: float | None = None, stribeck: float | None = None) -> None:
         super().__init__()
         if not isinstance(robot, Robot):
-            raise TypeError(f"robot: found {type(robot).__name__}; accepted: what torchid.load_robot returns")
+            raise TypeError(f"robot: found {type(robot).__name__}; accepted: a Robot from torchid.load_robot")
         self.sign_width = sign_width
         self.stribeck = stribeck
         self._indices: dict[tuple[int, ...], Tensor] = {}
@@ -178,7 +178,7 @@ class KinematicTree(nn.Module):
         self.register_buffer(name, torch.tensor(np.ascontiguousarray(value), dtype=dtype), persistent=False)
 
     def get_extra_state(self) -> Tensor:
-        """What a `state_dict` has of the robot, (L, 31 + n + 6 F) float64: all that its regressor depends on."""
+        """Robot constants for a `state_dict`, (L, 31 + n + 6 F) float64: all that the regressor depends on."""
         rows = []
         for node in self._nodes:
             kind = [node.parent, node.slides, self.base_rows, node.offset]
@@ -187,20 +187,16 @@ class KinematicTree(nn.Module):
         return torch.tensor(np.array(rows), dtype=torch.float64)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Refuse the `state_dict` of another robot: what was trained beside its regressor is not this one's.
-
-        Raises:
-            InputError: it is another robot's.
-        """
+        """Raise InputError if the `state_dict` belongs to another robot."""
         expected = self.get_extra_state()
         if state.shape != expected.shape:
             sizes = [
                 f"{len(x)} frames and {x.shape[1] - expected.shape[1] + self.n_dofs} joints" for x in (state, expected)
             ]
-            reason = f"another one, of {' instead of '.join(sizes)}"
+            reason = f"another robot, with {' instead of '.join(sizes)}"
         elif differs := ((state.to(expected) - expected).abs().amax(dim=1) > _SAME).nonzero()[:, 0].tolist():
             bodies = dict.fromkeys(self._body_names[self.body_of[node]] for node in differs)
-            reason = f"another one, which differs at {join_names(list(bodies))}"
+            reason = f"another robot: {join_names(list(bodies))} differ"
         else:
             return
         raise InputError("load_state_dict", "robot", reason, "the state of a module of the same robot")
@@ -212,7 +208,7 @@ class KinematicTree(nn.Module):
         return self
 
     def index(self, numbers: Iterable[int]) -> Tensor:
-        """Numbers as an index on the module's device, (len,) int64, made once: every other would be a copy to a GPU."""
+        """Numbers as an index on the module's device, (len,) int64, cached to avoid repeated copies to a GPU."""
         key = tuple(numbers)
         if key not in self._indices:
             with torch.inference_mode(False):  # others may come back to it with gradients
@@ -239,11 +235,11 @@ class KinematicTree(nn.Module):
         return self._path_maps[key]
 
     def coulomb_sign(self, velocity: Tensor) -> Tensor:
-        """Sign (...) of velocities (...) [rad/s or m/s] as Coulomb friction has it, smooth if a width is given."""
+        """Factor (...) of Coulomb friction at velocities (...) [rad/s or m/s]: sign, or tanh with a width."""
         return torch.sign(velocity) if self.sign_width is None else torch.tanh(velocity / self.sign_width)
 
     def stribeck_share(self, velocity: Tensor) -> Tensor:
-        """Share (...) of its friction at rest that Stribeck friction has at velocities (...) [rad/s or m/s]."""
+        """Factor (...) of Stribeck friction at velocities (...) [rad/s or m/s]."""
         return self.coulomb_sign(velocity) * torch.exp(-((velocity / (self.stribeck or torch.inf)) ** 2))
 
     def frame(self, robot: Robot, link: str, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[int, Array]:

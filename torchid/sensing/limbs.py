@@ -1,7 +1,7 @@
-"""Whitened null-space bases of robots that stand on limbs with as many joints as their contact leaves unmeasured.
+"""Fast whitened null-space bases for limbs with as many joints as unmeasured contact components.
 
-Point feet on three joints, flat feet on six: nearly all that walks. Each limb's joints follow from the base's motion,
-by a small square system, so that no batch of decompositions of all limbs together is needed.
+This covers most walking robots: point feet on three joints, flat feet on six. The motion of a limb follows from that of
+the base by a small square system; no decomposition of all limbs together is needed.
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ def limb_null_space(
 
 
 def _orthonormalize(columns: Tensor, suspect: Tensor) -> None:
-    """Make the columns of matrices (m, n, B) orthonormal in place, each by those before it; name those that fail.
+    """Make the columns of matrices (m, n, B) orthonormal in place; mark samples where this fails in `suspect`.
 
-    By the modified Gram-Schmidt process: a Cholesky factor of their products would square their condition.
+    Uses the modified Gram-Schmidt process; a Cholesky factor of their products would square their condition number.
     """
     least = PIVOT * columns.square().sum(0)
     for j in range(columns.shape[1]):

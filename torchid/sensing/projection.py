@@ -17,10 +17,15 @@ _SUSPECT = 1e3  # below this many tolerances, the QR path hands the sample to an
 
 @dataclass(frozen=True)
 class ProjectedGroup:
-    """Samples that share a contact state and a rank.
+    """Projected samples that share a contact state and a rank r.
 
-    `index`, (B',), into the batch; `active`, (k,) bool, rows of J_C in contact; `V`, (B', n_rows, r); `K`, (B', r, P);
-    `f`, (B', r); `base_rank`, (B',), rank(S_b V_x). `V` is whitened, no longer orthonormal, if a noise was given.
+    Attributes:
+        index: (B',), numbers of the samples in the batch.
+        active: (k,) bool, rows of J_C in contact.
+        V: (B', n_rows, r), V_x; orthonormal, or whitened if noise was given.
+        K: (B', r, P), V_x^T K.
+        f: (B', r), V_x^T f.
+        base_rank: (B',), rank(S_b V_x); 6 if the base is observable.
     """
 
     index: Tensor
@@ -34,19 +39,20 @@ class ProjectedGroup:
 
 
 class Projection(nn.Module):
-    """V_x, V_x^T K and V_x^T f for one sensor set.
+    """Removes unmeasured forces from the dynamics: computes V_x, V_x^T K and V_x^T f for one sensor set.
 
-    The unmeasured forces enter through `A_x = [S_x; J_x]`: rows of unit vectors for unmeasured joint torques, rows of
-    the contact Jacobian for unmeasured wrench components of active contacts. `V_x` spans its null space, so that no
-    unmeasured force is in `V_x^T K phi = V_x^T A_m^T [tau_m; lambda_m]`.
+    Unmeasured forces enter the dynamics through `A_x = [S_x; J_x]`: unit rows for unmeasured joint torques, rows of the
+    contact Jacobian for unmeasured wrench components of active contacts. `V_x` spans the null space of `A_x`. The
+    projected equation `V_x^T K phi = V_x^T A_m^T [tau_m; lambda_m]` contains measured forces only.
 
-    Gradients flow to all arguments, the Jacobian included: through `V_x` too, whose choice is arbitrary, so that only
-    losses that do not depend on it (squares of projected forces, their sum over a batch) have one that means
-    something. Where an active contact loses rank (a straight knee), the null space jumps and has no derivative.
+    Source: Mistry, Schaal, Yamane 2009, eq. 7 to 9.
 
-    Takes any K, dense and with any sensors, and is differentiable. Fits take `torchid.RowBuilder`, which uses the same
-    null spaces but multiplies V_x^T into the bodies' wrenches, for speed
-    (`tests/problem/test_rows_two_ways.py` compares both).
+    Gradients flow to all arguments, also through `V_x`. The basis `V_x` is arbitrary, so only losses that do not depend
+    on its choice (such as the sum of squared projected forces) have a meaningful gradient. There is no derivative where
+    an active contact loses rank (a straight knee).
+
+    K may be any matrix with the rows of the dynamics. Fits use the faster `torchid.RowBuilder` with the same null
+    spaces (`tests/problem/test_rows_two_ways.py` compares both).
     """
 
     def __init__(
@@ -58,28 +64,28 @@ class Projection(nn.Module):
         wrench_noise: float | Tensor | None = None,
         base_noise: float | Tensor | None = None,
     ) -> None:
-        """Fix the masks.
+        """Set the sensors.
 
         Args:
             torque_measured: (n,) bool.
-            wrench_measured: (k,) bool, by the rows of J_C.
+            wrench_measured: (k,) bool, in the order of the rows of J_C.
             base_rows: 6, or 0 for a fixed base.
-            torque_noise: standard deviation [N m], scalar or (n,). With all three given, rows are whitened.
+            torque_noise: standard deviation [N m], scalar or (n,). If all three are given, rows are whitened.
             wrench_noise: standard deviation [N or N m], scalar or (k,).
-            base_noise: floor of the base rows [N or N m], scalar or (6,).
+            base_noise: standard deviation of the base rows without sensor noise [N or N m], scalar or (6,).
 
         Raises:
-            ValueError: a mask that is not 1-D; some but not all noises given, or one that is not positive.
+            ValueError: a mask is not 1-D, only some of the noises are given, or one is not positive.
         """
         super().__init__()
         noises = (torque_noise, wrench_noise, base_noise)
         if any(x is None for x in noises) and any(x is not None for x in noises):
-            raise ValueError("torque_noise, wrench_noise, base_noise: found some; accepted: all three or none")
+            raise ValueError("torque_noise, wrench_noise, base_noise: found only some; accepted: all three or none")
         torque = torch.as_tensor(torque_measured, dtype=torch.bool)
         wrench = torch.as_tensor(wrench_measured, dtype=torch.bool, device=torque.device)
         for name, mask in (("torque_measured", torque), ("wrench_measured", wrench)):
             if mask.ndim != 1:
-                raise ValueError(f"{name}: found shape {tuple(mask.shape)}; accepted: a bool for each row, 1-D")
+                raise ValueError(f"{name}: found shape {tuple(mask.shape)}; accepted: 1-D, one bool per row")
         self.base_rows = base_rows
         self.register_buffer("torque_measured", torque, persistent=False)
         self.register_buffer("wrench_measured", wrench, persistent=False)
@@ -92,7 +98,7 @@ class Projection(nn.Module):
             rows = torch.cat([base_std.expand(base_rows), torque_std.expand(len(torque))])
             wrench_std = wrench_std.expand(len(self.get_buffer("wrench_measured")))
             if not bool((rows > 0.0).all()) or not bool((wrench_std > 0.0).all()):
-                raise ValueError("torque_noise, base_noise, wrench_noise: found a value that is not positive")
+                raise ValueError("torque_noise, wrench_noise, base_noise: found 0 or less; accepted: positive numbers")
             self.register_buffer("row_std", rows, persistent=False)
             self.register_buffer("wrench_std", wrench_std, persistent=False)
 
@@ -100,25 +106,24 @@ class Projection(nn.Module):
         """What `repr` says."""
         torque = self.get_buffer("torque_measured")
         wrench = self.get_buffer("wrench_measured")
-        measured = f"{int(torque.sum())} of {len(torque)} torques, {int(wrench.sum())} of {len(wrench)} of contacts"
-        return f"measured: {measured}"
+        return f"measured: {torque.sum()} of {len(torque)} torques, {wrench.sum()} of {len(wrench)} contact components"
 
     def forward(self, J_C: Tensor, active: Tensor, K: Tensor, torque: Tensor, wrench: Tensor) -> list[ProjectedGroup]:
         """Project a batch.
 
         Args:
             J_C: (B, k, n_rows), contact Jacobian with the rows of all contacts, active or not.
-            active: (B, k) bool, rows whose contact touches the ground. The wrench of others is zero, whatever was read.
+            active: (B, k) bool, rows whose contact touches the ground. The wrench of other rows counts as zero.
             K: (B, n_rows, P), or any other matrix with the rows of the dynamics.
-            torque: (B, n), read only where measured [N m].
-            wrench: (B, k), by the rows of J_C, read only where measured and active [N, N m].
+            torque: (B, n) [N m]; unmeasured values are ignored.
+            wrench: (B, k), in the order of the rows of J_C [N, N m]; unmeasured or inactive values are ignored.
 
         Returns:
-            One group per contact state and rank, every sample in exactly one.
+            One group per contact state and rank; every sample is in exactly one group.
 
         Raises:
-            TypeError: one that is not a tensor; `active` is not bool; another is of another precision than `K`.
-            ValueError: wrong shapes.
+            TypeError: an argument is not a tensor, `active` is not bool, or another dtype differs from that of `K`.
+            ValueError: a shape is wrong.
         """
         self._require_batch({"J_C": J_C, "active": active, "K": K, "torque": torque, "wrench": wrench})
         groups: list[ProjectedGroup] = []
@@ -133,7 +138,7 @@ class Projection(nn.Module):
         return groups
 
     def _require_batch(self, batch: dict[str, Tensor]) -> None:
-        """Refuse arguments of `forward`, by name, that do not belong together."""
+        """Raise TypeError or ValueError if the arguments of `forward` do not fit together."""
         for name, x in batch.items():
             if not isinstance(x, Tensor):
                 raise TypeError(f"{name}: found {type(x).__name__}; accepted: a tensor")
@@ -149,7 +154,7 @@ class Projection(nn.Module):
         for name, x in batch.items():
             expected = torch.bool if name == "active" else K.dtype
             if x.dtype != expected:
-                suffix = "" if name == "active" else ", as of K"
+                suffix = "" if name == "active" else ", the dtype of K"
                 raise TypeError(f"{name}: found {x.dtype}; accepted: {expected}{suffix}")
 
     def _state(
@@ -176,7 +181,7 @@ class Projection(nn.Module):
         return groups
 
     def _bases(self, J_x: Tensor, J_m: Tensor, measured: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
-        """Null-space bases on the rows of the base and of measured torques: in the others the torque is unknown."""
+        """Null-space bases on the rows of the base and of measured torques."""
         kept = self.get_buffer("kept")
         if not self._whiten:
             return null_space(J_x[:, :, kept])
@@ -199,16 +204,15 @@ def base_rank(singular_values: Tensor) -> Tensor:
 def null_space(A: Tensor, size: float | Tensor = 1.0) -> Iterator[tuple[Tensor | slice, Tensor]]:
     """Orthonormal bases of the null spaces of a batch of matrices, grouped by rank.
 
-    A QR factorization of the transpose serves samples of full row rank; only those that might have lost rank (straight
-    knees) pay for a singular value decomposition. Which basis of a null space comes out is arbitrary, and so is its
-    gradient; whatever depends on the null space alone, such as `V V^T` or the norm of `V^T f`, has the right one as
-    long as the rank stays. Where the rank changes, null spaces jump: there is no derivative, and what is returned is
-    that along motions that keep the rank.
+    Samples of full row rank use a QR factorization of the transpose. Samples that may have lost rank (straight knees)
+    use a singular value decomposition. The basis of a null space is arbitrary, and so is its gradient. Functions of the
+    null space alone, such as `V V^T` or the norm of `V^T f`, have the right gradient as long as the rank does not
+    change. Where it changes there is no derivative; the returned gradient is that along motions of constant rank.
 
     Args:
         A: (B, k, m); with gradient if it requires one.
-        size: of the terms that its entries are sums of, 1 for the work of unit wrenches. Singular values below rounding
-            of it are zero, even if all are: a wrench can act on no measured degree of freedom.
+        size: size of the terms that are summed in its entries; 1 for the work of unit wrenches. Singular values below
+            the rounding error of this size count as zero.
 
     Yields:
         (index of the samples, V): V is (B', m, m - rank) with `A @ V = 0` and `V^T V = I`.
@@ -233,9 +237,9 @@ def whitened_null_space(
         row_std: (m,), > 0, noise of the generalized force itself (torque sensors, floor of the base rows) [N, N m].
         J_m: (B, k_m, m), rows of the contact Jacobian whose wrench component is measured.
         wrench_std: (k_m,), noise of each measured wrench component [N, N m].
-        axes: (B, 3, 3), columns are the unit vectors in the base frame that the base rows of `row_std` are along; None:
-            the base's own axes.
-        order: (m,) int64, of the m rows; where A is empty, column i of W is zero but in the first i + 1 of them.
+        axes: (B, 3, 3), columns are unit vectors in the base frame: the axes of the base rows of `row_std`; None for
+            the axes of the base.
+        order: (m,) int64, order of the m rows; if A is empty, column i of W is zero except in the first i + 1 of them.
 
     Yields:
         (index of the samples, W): W is (B', m, m - rank) with `A @ W = 0` and `W^T S W = I`, where S, the covariance of
@@ -273,16 +277,16 @@ def _triangular_root(row_std: Tensor, J_m: Tensor, wrench_std: Tensor, order: Te
 
 
 def _cholesky(covariance: Tensor) -> Tensor:
-    """Lower triangles of matrices (B, r, r) not below the identity: only numbers that are not finite can make it fail.
+    """Lower triangles of matrices (B, r, r) that are at least the identity. Only non-finite numbers can make it fail.
 
-    That is an error on the CPU alone: to hear of it, the host would wait for a GPU. There the triangle is not finite.
+    On a CPU a failure raises. On a GPU the check would synchronize, so the result is not finite instead.
     """
     L: Tensor = torch.linalg.cholesky_ex(covariance, check_errors=covariance.device.type == "cpu").L
     return L
 
 
 def _along(X: Tensor, axes: Tensor) -> Tensor:
-    """Rows (B, k, m) whose force and moment on the base are given by their components along some axes."""
+    """Rows (B, k, m) with the force and moment on the base expressed along other axes."""
     return torch.cat([X[..., :3] @ axes, X[..., 3:6] @ axes, X[..., 6:]], dim=-1)
 
 
@@ -324,8 +328,8 @@ def _bases(A: Tensor, floor: float | Tensor) -> Iterator[tuple[Tensor | slice, T
 def complement(reflectors: Tensor, tau: Tensor) -> Tensor:
     """The last m - k columns of Q, (B, m, m - k), from what `torch.geqrf` returns of (B, m, k).
 
-    All samples at once, from the product of their reflections in closed form, `1 - Y T Y^T` (Schreiber, Van Loan 1989):
-    on a GPU, `torch.ormqr` takes one sample after the other. On a CPU that is the faster of the two.
+    All samples at once, from the product of their reflections in closed form, `1 - Y T Y^T` (Schreiber, Van Loan 1989).
+    Faster on a GPU, where `torch.ormqr` works sample by sample; slower on a CPU.
     """
     m, k = reflectors.shape[1:]
     Y = reflectors.tril(-1)
@@ -337,10 +341,9 @@ def complement(reflectors: Tensor, tau: Tensor) -> Tensor:
 
 
 def any_suspect(suspect: Tensor) -> bool:
-    """Whether any sample needs its singular values: the one number of a chunk that the host waits for.
+    """Whether any sample needs its singular values.
 
-    The shapes of whatever comes after it depend on it. Only where there are such samples, the host waits for their
-    numbers and ranks too.
+    All later shapes depend on this number, so it is the only one of a chunk that the host waits for.
     """
     return bool(suspect.any())
 

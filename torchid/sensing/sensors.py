@@ -1,4 +1,4 @@
-"""Contacts, where the environment can push, and sensor sets, masks over joint torques and contact-wrench components."""
+"""Contacts with the environment, and sensor sets: masks over joint torques and contact-wrench components."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CONTACT_TYPES = ("point", "line", "flat")
 NORMAL_FORCE = "fn"
 """Name of the component that a scalar sensor of a contact reads."""
 NORMAL_INDEX = 2
-"""Its place among the components of a contact whose force is along the axes of the ground."""
+"""Index of that component."""
 
 
 UP = (0.0, 0.0, 1.0)
@@ -32,19 +32,20 @@ def join_numbers(numbers: Iterable[float]) -> str:
 
 @dataclass(frozen=True)
 class Contact:
-    """A contact at a URDF frame.
+    """A contact at a link frame.
 
-    `kind`: "point" exerts three force components; "flat" all six; "line" all but the moment about the line, which runs
-    along the frame's `line_axis`.
-
-    With a `radius` [m] a point is a sphere about the frame's origin c that rolls on the ground, a line a cylinder about
-    `line_axis`: the ground acts at c - radius n, n being `normal`, (3,), a unit vector in the world that points away
-    from the ground (of a cylinder its part across the axis). Readings are wrenches at c all the same; of a line's
-    force, the part along the axis then counts as acting at c, since moments across the axis are free.
-    `centre`, (3,) [m]: c of a point in the frame, where a ball's centre lies beside the frame's origin.
-
-    `along_normal`: the contact has a scalar sensor, which reads the force along `normal` alone, "fn". The axes of its
-    force are then the ground's, fz that along the normal and fx and fy across it, instead of the frame's.
+    Attributes:
+        frame: name of a link.
+        kind: "point" transmits three force components, "flat" all six wrench components, "line" all except the moment
+            about the line.
+        line_axis: axis of the frame along the line: "x", "y" or "z".
+        radius: [m]. A point with a radius is a sphere about c that rolls on the ground; a line is a cylinder about
+            `line_axis`. The ground acts at c - radius n (for a cylinder with n perpendicular to the axis). Readings are
+            wrenches at c. On a cylinder, the force along the axis counts as acting at c.
+        normal: n, (3,), unit vector in the world that points away from the ground.
+        along_normal: whether the contact has a scalar sensor "fn" that measures the force along `normal` only. The
+            force components then refer to the ground: fz along the normal, fx and fy across it.
+        centre: c, (3,) [m], in the frame, for a sphere whose centre is not the frame's origin.
     """
 
     frame: str
@@ -56,11 +57,11 @@ class Contact:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Validate all, and give the normal unit length.
+        """Check the values and normalize the normal.
 
         Raises:
-            SensorError: an unknown kind or line axis, a radius that is negative or a flat contact's, a centre of
-                another contact than a point, a normal of no length.
+            SensorError: `kind` or `line_axis` is unknown, `radius` is negative or set for a flat contact, `centre` is
+                set for a line or flat contact, or `normal` has length 0.
         """
         if self.kind not in CONTACT_TYPES:
             raise SensorError(f"contact '{self.frame}'", "type", f"'{self.kind}'", ", ".join(CONTACT_TYPES))
@@ -70,22 +71,21 @@ class Contact:
             raise SensorError(f"contact '{self.frame}'", "radius", f"{self.radius:g}", "a number of at least 0 [m]")
         if self.radius and self.kind == "flat":
             accepted = "type point (a sphere) or line (a cylinder), or radius 0"
-            raise SensorError(f"contact '{self.frame}'", "radius", f"{self.radius:g} of a flat contact", accepted)
+            raise SensorError(f"contact '{self.frame}'", "radius", f"{self.radius:g} for a flat contact", accepted)
         if len(self.centre) != 3 or not np.isfinite(self.centre).all() or self.kind != "point" and any(self.centre):
-            accepted = "three numbers [m] in the frame of a point"
+            accepted = "three numbers [m] in the contact's frame, for a point contact"
             raise SensorError(f"contact '{self.frame}'", "centre", join_numbers(self.centre), accepted)
         length = float(np.linalg.norm(self.normal))
         if len(self.normal) != 3 or not 0.0 < length < np.inf:
-            raise SensorError(
-                f"contact '{self.frame}'", "normal", join_numbers(self.normal), "three numbers, not all 0, in the world"
-            )
+            accepted = "three numbers in the world, not all 0"
+            raise SensorError(f"contact '{self.frame}'", "normal", join_numbers(self.normal), accepted)
         if length != 1.0:
             x, y, z = (float(component) / length for component in self.normal)
             object.__setattr__(self, "normal", (x, y, z))
 
     @property
     def components(self) -> tuple[int, ...]:
-        """Indices in `WRENCH_COMPONENTS` of the components that can differ from zero."""
+        """Indices in `WRENCH_COMPONENTS` of the components that the contact can transmit."""
         if self.kind == "point":
             return _FORCES
         if self.kind == "flat":
@@ -94,17 +94,17 @@ class Contact:
 
     @property
     def rolling_axis(self) -> str | None:
-        """Axis of the frame about which a line rolls; None for a point, whose sphere has none."""
+        """Axis of the frame about which a line contact rolls; None for a point contact."""
         return self.line_axis if self.kind == "line" else None
 
     def pose(self, frame_pose: Array) -> Array:
-        """Poses (..., 4, 4) of the frame, its origin moved to the contact's centre."""
+        """Poses (..., 4, 4) of the frame with its origin at the contact's centre."""
         moved = frame_pose.copy()
         moved[..., :3, 3] += moved[..., :3, :3] @ np.array(self.centre)
         return moved
 
     def component_name(self, k: int) -> str:
-        """Name of a component that its sensors measure, by index in `WRENCH_COMPONENTS`."""
+        """Name of the measured component k, an index in `WRENCH_COMPONENTS`."""
         return NORMAL_FORCE if self.along_normal and k == NORMAL_INDEX else WRENCH_COMPONENTS[k]
 
     @property
@@ -114,11 +114,11 @@ class Contact:
 
 
 def validate_contacts(robot: Robot, contacts: Sequence[Contact]) -> tuple[Contact, ...]:
-    """The contacts, after making sure that the robot has their frames.
+    """Check contacts against a robot, and return them.
 
     Raises:
-        UnknownNameError: a frame that the URDF does not have.
-        SensorError: a frame named twice.
+        UnknownNameError: the robot has no such frame.
+        SensorError: a frame is named twice.
     """
     seen: set[str] = set()
     for index, contact in enumerate(contacts):
@@ -142,14 +142,15 @@ PerJoint = float | tuple[float, ...]
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Standard deviations of the sensors, and those of the base rows beside the sensors' [N, N m].
+    """Standard deviations of the sensor noise [N, N m]. The defaults are rough guesses.
 
-    `base_force` and `base_moment` are the errors of the base rows that are no force sensor's (differentiated motion,
-    soft contacts): without them a base row in flight, where no sensor contributes noise, would count as exact. By
-    default they are one contact sensor's noise, and so are those of force/torque sensors in limbs. Three numbers are
-    for the axes x, y, z of the levelled base, see `torchid.problem.motion.levelled_base_axes`. `joint_torque`, in
-    N of a joint that slides, may have a number for each joint, as estimates do. The defaults are
-    rough, for library users and as the start of the estimation in `torchid.problem.noise`.
+    Attributes:
+        joint_torque: one number for all joints, or one per joint [N m; N for a prismatic joint].
+        contact_force, contact_moment: of contact sensors [N, N m].
+        base_force, base_moment: of the base rows, for errors that no force sensor makes (differentiated motion, soft
+            contacts). Without them, base rows in flight would count as exact. One number, or three for the x, y, z axes
+            of the levelled base (`torchid.problem.motion.levelled_base_axes`). None for the noise of a contact sensor.
+        ft_force, ft_moment: of limb force/torque sensors [N, N m]; None for the noise of a contact sensor.
     """
 
     joint_torque: PerJoint = 0.5
@@ -162,7 +163,7 @@ class SensorNoise:
 
     @classmethod
     def of_known(cls, known: Mapping[str, Any]) -> SensorNoise:
-        """The noise of readings with what is known of it by field, and NaN for all else."""
+        """Sensor noise from known values by field; unknown values are NaN."""
         return cls(**dict.fromkeys(("joint_torque", "contact_force", "contact_moment"), np.nan) | dict(known))
 
     @property
@@ -174,29 +175,29 @@ class SensorNoise:
 
     @property
     def base_axes_differ(self) -> bool:
-        """Whether the standard deviations of the base rows differ from axis to axis."""
+        """Whether the standard deviations of the base rows differ between axes."""
         return bool(np.ptp(self.base_std.reshape(2, 3), axis=1).any())
 
     @property
     def limb_std(self) -> tuple[float, float]:
-        """Standard deviations of a force and of a moment that a force/torque sensor in a limb reads [N, N m]."""
+        """Standard deviations of force and moment of a limb force/torque sensor [N, N m]."""
         force = self.contact_force if self.ft_force is None else self.ft_force
         moment = self.contact_moment if self.ft_moment is None else self.ft_moment
         return force, moment
 
     def dof_std(self, n: int, count: int) -> Array:
-        """Standard deviations by `Robot.dof_names`: n joint torques, then wrenches in limbs, (count,) [N m, N, N m].
+        """Standard deviations, (count,) [N m, N, N m], in the order of `Robot.dof_names`: joint torques, limb wrenches.
 
         Raises:
-            SensorError: `joint_torque` has neither one number nor n.
+            SensorError: `joint_torque` has neither one number nor n numbers.
         """
         joints = np.asarray(self.joint_torque, dtype=float)
         if joints.shape not in ((), (n,)):
-            raise SensorError("noise", "joint_torque", f"{joints.size} numbers", f"one for all joints, or {n}")
+            raise SensorError("noise", "joint_torque", f"{joints.size} numbers", f"1 number for all joints, or {n}")
         return np.append(np.broadcast_to(joints, n), np.tile(np.repeat(self.limb_std, 3), (count - n) // 6))
 
     def scaled(self, factor: float) -> SensorNoise:
-        """All standard deviations times a factor."""
+        """Multiply all standard deviations by a factor."""
         scaled: dict[str, Any] = {
             name: tuple(factor * number for number in x) if isinstance(x, tuple) else factor * x
             for name, x in vars(self).items()
@@ -212,13 +213,14 @@ class SensorNoise:
 
 @dataclass(frozen=True)
 class SensorSet:
-    """Which forces are measured.
+    """A sensor set: which forces are measured, and their noise.
 
-    `torque`, (n + 6 F,) bool, by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs; `wrench`,
-    (C, 6) bool, by contacts and `WRENCH_COMPONENTS`.
-
-    `task_weights`, (n_rows,) > 0: how much errors of the generalized forces, those of a floating base along its own
-    axes first, count in a fit, beside their noise; None for all alike.
+    Attributes:
+        torque: (n + 6 F,) bool, in the order of the robot's `dof_names`: joint torques, then limb sensor wrenches.
+        wrench: (C, 6) bool, by contact and `WRENCH_COMPONENTS`.
+        noise: standard deviations.
+        task_weights: (n_rows,) > 0, additional weights of the errors of the generalized forces (base rows first, along
+            the axes of the base); None for equal weights.
     """
 
     torque: np.ndarray
@@ -229,15 +231,22 @@ class SensorSet:
     __repr__ = short_repr
 
     def _headline(self) -> str:
-        of_contacts = f"{int(self.wrench.sum())} components at contacts"
-        return f"{int(self.torque.sum())} joint torques and readings in limbs, {of_contacts}"
+        wrenches = f"{int(self.wrench.sum())} contact components"
+        return f"{int(self.torque.sum())} joint torques and limb sensor components, {wrenches}"
 
 
 def named_sensors(name: str, n: int, contacts: int, noise: SensorNoise | None = None, ft: int = 0) -> SensorSet:
-    """One of the three sets that have a name: "full", "contacts" or "joints", without the `ft` sensors in limbs.
+    """Return a named sensor set: "full", "contacts" or "joints".
+
+    Args:
+        name: "full" measures all joint torques and contact wrenches, "contacts" or "joints" only one of the two.
+        n: number of independent joints.
+        contacts: number of contacts.
+        noise: of the sensors.
+        ft: number of the robot's limb force/torque sensors; none of them is in the set.
 
     Raises:
-        SensorError: another name.
+        SensorError: the name is another one.
     """
     if name not in NAMED_SETS:
         raise SensorError("sensors", "name", f"'{name}'", f"{', '.join(NAMED_SETS)}, or a mapping of sensors")
@@ -248,10 +257,10 @@ def named_sensors(name: str, n: int, contacts: int, noise: SensorNoise | None = 
 
 
 def with_ft_sensors(sensors: SensorSet, robot: Robot, names: Iterable[str]) -> SensorSet:
-    """The set with force/torque sensors in limbs, by the names of their fixed joints, beside what it has.
+    """Add limb force/torque sensors to a sensor set, by the names of their fixed joints.
 
     Raises:
-        UnknownNameError: one that the robot was not loaded with.
+        UnknownNameError: the robot was not loaded with this sensor.
     """
     torque = sensors.torque.copy()
     for name in names:
@@ -270,20 +279,19 @@ def chosen_sensors(
     noise: SensorNoise | None = None,
     ft: int = 0,
 ) -> SensorSet:
-    """A sensor set, chosen by the names of joints and of components of contact wrenches.
+    """Make a sensor set from names of joints and components of contact wrenches.
 
     Args:
         joint_names: the robot's independent joints.
-        contacts: the contacts in use.
-        joint_torques: joints whose torque is measured.
-        contact_wrenches: measured components ("fx" ... "mz") by contact frame, or "fn" alone of one that is read
-            `along_normal`.
+        contacts: the contacts.
+        joint_torques: joints with a measured torque.
+        contact_wrenches: measured components ("fx" ... "mz") by contact frame; "fn" for a contact with `along_normal`.
         noise: of the sensors.
-        ft: force/torque sensors in limbs that the robot has; none of them is in the set.
+        ft: number of the robot's limb force/torque sensors; none of them is in the set.
 
     Raises:
-        UnknownNameError: a joint, contact or component that does not exist.
-        SensorError: a component that its contact cannot exert.
+        UnknownNameError: a joint, contact or component does not exist.
+        SensorError: the contact cannot transmit a component.
     """
     torque = np.zeros(len(joint_names) + 6 * ft, dtype=bool)
     for name in joint_torques:
@@ -306,23 +314,23 @@ def chosen_sensors(
             if name not in WRENCH_COMPONENTS:
                 raise UnknownNameError.at_field(field_name, name, contact.component_names)
             if name not in contact.component_names:
-                reason = f"'{name}', which a {contact.kind} contact cannot exert"
+                reason = f"'{name}' does not exist at a {contact.kind} contact"
                 raise SensorError.at_field(field_name, reason, ", ".join(contact.component_names))
             wrench[frames.index(frame), WRENCH_COMPONENTS.index(name)] = True
     return SensorSet(torque, wrench, noise or SensorNoise())
 
 
 def _check_scalar(field_name: str, contact: Contact, names: Sequence[str]) -> None:
-    """Refuse components beside that of a scalar sensor, and a contact that is read along other axes."""
+    """Raise SensorError if "fn" is mixed with other components, or the contact has no scalar sensor."""
     others = [name for name in names if name != NORMAL_FORCE]
     if others:
-        reason = f"'{others[0]}' of a contact whose force is read along the ground's normal, '{NORMAL_FORCE}'"
-        accepted = f"[{NORMAL_FORCE}] alone, or components of the wrench without it"
+        reason = f"'{others[0]}', but this sensor measures only '{NORMAL_FORCE}'"
+        accepted = f"[{NORMAL_FORCE}], or wrench components without {NORMAL_FORCE}"
         raise SensorError.at_field(field_name, reason, accepted)
     if not contact.along_normal:
-        reason = f"'{NORMAL_FORCE}' of a contact whose wrench is read"
-        accepted = f"{', '.join(contact.component_names)}; {NORMAL_FORCE} if the experiment's own sensors have it too "
-        accepted += "(in Python: a Contact with along_normal=True)"
+        reason = f"'{NORMAL_FORCE}', but this contact has a wrench sensor"
+        accepted = f"{', '.join(contact.component_names)}; for {NORMAL_FORCE} set it in the experiment's sensors too "
+        accepted += "(in Python: Contact(..., along_normal=True))"
         raise SensorError.at_field(field_name, reason, accepted)
 
 
@@ -335,9 +343,9 @@ def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.n
 
 
 def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
-    """Recorded components (C, 6) from which the measured ones are computed: whole vectors if along world axes.
+    """Recorded components (C, 6) that the measured ones are computed from.
 
-    Of a contact that is read along the ground's normal they are those that are measured.
+    Along world axes these are all components of a vector; a scalar sensor has its own component only.
     """
     measured = measured_components(contacts, sensors)
     if not in_world:
@@ -348,7 +356,7 @@ def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_worl
 
 
 def minimized_errors(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> str:
-    """What a fit with some sensors minimizes, in words: errors of which forces, and what they are free of."""
+    """Which errors a fit with these sensors minimizes, and of which unmeasured forces they are independent."""
     torque = sensors.torque[: robot.n]
     measured = measured_components(contacts, sensors)
     rows = ["joint torques"] * bool(torque.any()) + ["base forces"] * (not robot.fixed_base)
@@ -361,4 +369,4 @@ def minimized_errors(robot: Robot, contacts: Sequence[Contact], sensors: SensorS
         x.frame for x, components in zip(contacts, measured, strict=True) if components.sum() < len(x.components)
     ]:
         makers.append(f"unmeasured force at {join_names(frames)}" if measured.any() else "contact force")
-    return f"errors of {' and '.join(rows)}" + f" that no {' or '.join(makers)} can make" * bool(makers)
+    return f"errors of {' and '.join(rows)}" + f", independent of {' and '.join(makers)}" * bool(makers)

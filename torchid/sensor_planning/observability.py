@@ -35,14 +35,12 @@ Axes that a URDF's rounded angles (1.5708) tilt by 4e-6 from parallel count as i
 
 @dataclass(frozen=True)
 class Candidate:
-    """A sensor that may be chosen.
+    """A sensor that a plan may choose.
 
-    `kind`: one of `SENSOR_KINDS`. `dofs`: indices in the robot's `dof_names` that a torque sensor, or a force/torque
-    sensor in a limb, measures. `contact`: index of the contact, and `components`, in `WRENCH_COMPONENTS`, of a sensor
-    there; that of a scalar sensor is the one along the ground's normal of a contact with such axes, see
-    `with_scalar_candidates`.
-    `name`: the joint; the contact's frame for a whole device, "l_sole.fx" for one axis of it, "l_sole.fn" for a scalar
-    sensor.
+    `kind`: one of `SENSOR_KINDS`. `dofs`: indices in the robot's `dof_names` measured by a torque sensor or a limb
+    force/torque sensor. `contact`: index of the contact, and `components`, in `WRENCH_COMPONENTS`, of a contact sensor.
+    A scalar sensor has the component along the ground's normal, see `with_scalar_candidates`. `name`: the joint; the
+    contact's frame for a whole device, "l_sole.fx" for one axis, "l_sole.fn" for a scalar sensor.
     """
 
     name: str
@@ -77,22 +75,21 @@ def candidates(
     ft_sensors: Sequence[str] = (),
     normal_forces: Sequence[str] = (),
 ) -> tuple[Candidate, ...]:
-    """All candidate sensors: joint torques in the robot's order, then the contacts', then those in limbs.
+    """All candidate sensors: joint torques in the robot's order, then contact sensors, then limb sensors.
 
     Args:
         robot: the robot.
-        contacts: all contacts; a sensor measures the components that its contact can exert.
-        joint_torques: joints that can carry a torque sensor; None for all with a motor.
-        per: "device", one force/torque sensor per contact, "axis", one candidate per component, or "none" at contacts.
-            In limbs, too, a candidate per component with "axis".
+        contacts: all contacts; a sensor measures the components that its contact can transmit.
+        joint_torques: joints that can have a torque sensor; None for all with a motor.
+        per: "device" for one force/torque sensor per contact, "axis" for one candidate per component (also for limb
+            sensors), or "none" for no contact sensors.
         costs: by name of a candidate, or by kind and then per channel; 1 per channel by default.
-        ft_sensors: fixed joints that can carry a force/torque sensor, among those that the robot was loaded with.
-        normal_forces: frames of contacts that can carry a scalar sensor of the force along the ground's normal, beside
-            a device or alone.
+        ft_sensors: fixed joints that can have a force/torque sensor; the robot must be loaded with them.
+        normal_forces: frames of contacts that can have a scalar sensor of the normal force, with or without a device.
 
     Raises:
-        UnknownNameError: a joint, a contact, or a name in `costs`, that does not exist.
-        SensorError: `per` is not in `PER`, or "axis" with scalar sensors; a cost is not a positive number.
+        UnknownNameError: a joint, a contact, or a name in `costs` does not exist.
+        SensorError: `per` is not in `PER`, or is "axis" with scalar sensors; or a cost is not positive.
     """
     if per not in PER:
         raise SensorError("sensors", "candidates.per", f"'{per}'", ", ".join(PER))
@@ -117,7 +114,7 @@ def _at_contacts(contacts: Sequence[Contact], per: str, normal_forces: Sequence[
         if name not in frames:
             raise UnknownNameError("sensors", "candidates.normal_forces", name, frames)
     if normal_forces and per == "axis":
-        reason = f"{', '.join(normal_forces)}, beside single axes of the contacts' frames"
+        reason = f"{', '.join(normal_forces)}, but candidates.contacts is axis"
         raise SensorError("sensors", "candidates.normal_forces", reason, "candidates.contacts: device or none")
     for index, contact in enumerate(contacts):
         if per == "device":
@@ -160,10 +157,10 @@ def _with_costs(offered: Sequence[Candidate], costs: Mapping[str, float]) -> tup
 def with_scalar_candidates(
     contacts: Sequence[Contact], candidates: Iterable[Candidate], sensors: SensorSet | None = None
 ) -> tuple[Contact, ...]:
-    """The contacts, those at which there are candidates of kind "normal_force" with the ground's axes.
+    """Give contacts with candidates of kind "normal_force" the axes of the ground.
 
-    Readings of all components are the same along any axes. A contact of which the sensors read some along its frame's
-    axes keeps these: it cannot have a scalar sensor beside them.
+    Whole wrenches are equivalent along any axes. A contact with single measured components along its frame's axes keeps
+    these axes, so it cannot have a scalar sensor too.
     """
     along = {candidate.contact for candidate in candidates if candidate.kind == "normal_force"}
     if sensors is not None:
@@ -188,7 +185,7 @@ def sensor_set(
 def contained_candidates(
     contacts: Sequence[Contact], sensors: SensorSet, candidates: Sequence[Candidate]
 ) -> tuple[Candidate, ...]:
-    """The candidates that a sensor set contains: those whose components are all measured."""
+    """The candidates in a sensor set: those with all components measured."""
     wrench = measured_components(contacts, sensors)
     return tuple(
         c
@@ -199,15 +196,15 @@ def contained_candidates(
 
 @dataclass(frozen=True, eq=False)
 class Demand:
-    """Demand of a group of contacts at one posture: sensors whose vectors span the target.
+    """Demand of a group of contacts at one posture: the sensors' vectors must span the target.
 
     Attributes:
-        contacts: indices of the group's contacts, ascending; `frames`: their names.
+        contacts: indices of the group's contacts, ascending.
+        frames: their names.
         joints: indices of the independent joints between the base and the contacts, ascending.
-        rows: (k,) the contact that each row of J belongs to.
+        rows: (k,) contact of each row of J.
         target: (k, d) orthonormal basis of range(J_b).
-        vectors: (k, w) unit vectors of every candidate that acts on the group; others, and those without a lever arm,
-            are absent.
+        vectors: (k, w) unit vectors of every candidate that acts on the group with a lever arm.
     """
 
     contacts: tuple[int, ...]
@@ -262,18 +259,18 @@ def demands(
     seed: int = 0,
     joint_position: Array | None = None,
 ) -> list[Demand]:
-    """Demands of some contact states, each group of contacts once; none for a fixed base.
+    """Demands of contact states, each group of contacts once; empty for a fixed base.
 
     Args:
         robot: the robot.
         contacts: all contacts.
         states: contact states.
         candidates: sensors to choose from.
-        seed: of the random posture, at which ranks are those of almost every posture.
-        joint_position: (n,), another posture instead, or one near it with closed loops [rad or m].
+        seed: of the random posture (ranks there are those of almost every posture).
+        joint_position: (n,), a posture to use instead; with closed loops, the nearest closed one [rad or m].
 
     Raises:
-        UrdfError: loops whose motors do not determine how they move.
+        UrdfError: the motors do not determine the motion of a loop.
     """
     if robot.fixed_base:
         return []
@@ -296,8 +293,8 @@ def _jacobian(builder: RowBuilder, posture: Samples, robot: Robot) -> Array:
     by_motors = builder.motors.of(builder.tree, builder.kinematics(posture).states, J)[:, :, 0].numpy()
     by_motors[..., [robot.base_rows + dof for dof in builder.motors.passive]] = 0.0
     if np.isnan(by_motors).any():
-        reason = "loops in which motors do not determine how the other joints move"
-        raise UrdfError(robot.path, LOOPS_FIELD, reason, "as many motors as a loop has motions, to plan sensors")
+        reason = "the motors of a loop do not determine its other joints"
+        raise UrdfError(robot.path, LOOPS_FIELD, reason, "one motor per degree of freedom of a loop, to plan sensors")
     return np.asarray(by_motors)
 
 
@@ -353,12 +350,13 @@ class BaseObservability:
     """Observability of the base with a sensor set in one contact state.
 
     Attributes:
-        state: the contact state; `name`: frames in contact, joined by "+".
+        state: the contact state.
+        name: frames in contact, joined by "+".
         generic: over random postures; its rank is that of almost every posture.
-        zero: at position zero of every joint, where many robots' limbs are straight.
+        zero: at joint positions of 0, where the limbs of many robots are straight.
         recorded: over postures of a log, or None.
-        lost: None if the generic rank is 6.
-        dependent: if the rank is deficient at position zero only, the sensors dependent there, by unmet demand.
+        lost: the unobservable part; None if the generic rank is 6.
+        dependent: linearly dependent sensors by unmet demand, if the rank is deficient only at joint positions of 0.
     """
 
     state: ContactState
@@ -389,15 +387,15 @@ class PostureSummary:
 
 @dataclass(frozen=True, eq=False)
 class LostBase:
-    """The part of the base's equations of motion that does not survive the projection with a sensor set.
+    """The part of the base's equations of motion that the projection removes with a sensor set.
 
     Attributes:
-        posture: (n,) [rad or m] at which it was computed.
+        posture: (n,) [rad or m] of the computation.
         directions: (6, m) orthonormal w, force then moment at the base origin in the base frame, with w^T S_b V_x = 0:
-            the equation of motion of the base along w is in none of the rows.
+            no row contains the base's equation of motion along w.
         descriptions: the same space as text, see `describe_wrench`.
-        unmet_groups: frames of each group of contacts whose demand is not met, and the missing dimensions.
-        remedies: candidates each of which, added alone, leaves fewer dimensions missing.
+        unmet_groups: frames of each group of contacts with an unmet demand, and the missing dimensions.
+        remedies: single candidates that reduce the missing dimensions.
     """
 
     posture: Array
@@ -505,10 +503,10 @@ def simple_wrench_basis(space: Array) -> list[Array]:
 
 
 def describe_wrench(wrench: Array) -> str:
-    """A wrench (6,) at the base origin along the base frame's axes, up to scale and sign.
+    """Text of a wrench (6,) at the base origin along the base axes, up to scale and sign.
 
-    "moment about (0.71, 0, 0.71)"; "force along (0, 0, 1)", if its line does not pass through the base origin "through
-    (0, 0.1, 0)" [m]; and "with 0.2 m of pitch" [m = N m per N] if a moment about the same line comes with it.
+    "moment about (0.71, 0, 0.71)"; "force along (0, 0, 1)", with "through (0, 0.1, 0)" [m] if its line does not pass
+    through the base origin, and "with pitch 0.2 m" [m = N m per N] if there is a moment about the same line.
     """
     wrench = wrench / np.linalg.norm(wrench)
     force = wrench[:3]
@@ -521,7 +519,7 @@ def describe_wrench(wrench: Array) -> str:
     text = f"force along {_vector(_signed(force))}"
     if np.linalg.norm(through) > _NEGLIGIBLE:
         text += f" through {_vector(through)}"
-    return text if abs(pitch) < _NEGLIGIBLE else f"{text} with {pitch:.2g} m of pitch"
+    return text if abs(pitch) < _NEGLIGIBLE else f"{text} with pitch {pitch:.2g} m"
 
 
 @dataclass(frozen=True)

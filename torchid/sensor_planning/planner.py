@@ -96,9 +96,9 @@ def irredundant_set(
     exclude: Iterable[Candidate] = (),
     done: Callable[[], None] | None = None,
 ) -> tuple[Candidate, ...]:
-    """Sensors with which the stack still has the rank of all candidates, and none of which is redundant for it.
+    """A sensor set with the rank of all candidates in which no sensor is redundant.
 
-    The most expensive are dropped first; a cheaper irredundant set may exist.
+    The most expensive sensors are dropped first; a cheaper irredundant set may exist.
 
     Raises:
         SensorError: without the excluded candidates the rank is lower.
@@ -107,8 +107,8 @@ def irredundant_set(
     excluded = frozenset(exclude)
     chosen = [c for c in stack.candidates if c not in excluded]
     if stack.rank(chosen) < stack.full:
-        reason = f"without {', '.join(sorted(c.name for c in excluded))} fewer parameters are determined"
-        raise SensorError("sensors", "exclude", reason, "other exclusions, or criterion: per_sample")
+        reason = f"without {', '.join(sorted(c.name for c in excluded))} the data determine fewer parameters"
+        raise SensorError("sensors", "exclude", reason, "fewer exclusions, or criterion: per_sample")
     for candidate in sorted(set(chosen) - kept, key=lambda c: (-c.cost, stack.candidates.index(c))):
         fewer = [c for c in chosen if c is not candidate]
         if stack.rank(fewer) == stack.full:
@@ -277,15 +277,17 @@ _TRIED = 4  # random postures: their largest rank is that of almost every postur
 
 @dataclass(frozen=True)
 class PlanningProblem:
-    """A scenario whose sensors are to be planned.
+    """A scenario for sensor planning.
 
     Attributes:
-        robot, contacts, states: the scenario. Contacts at which there are scalar sensors among the candidates are given
-            the ground's axes, along which sensor sets of the plan are then to be read.
-        candidates: sensors to choose from; `keep`: those in every set; `exclude`: those in none.
+        robot, contacts, states: the scenario. Contacts with scalar candidates get the axes of the ground; sensor sets
+            of the plan refer to these axes.
+        candidates: sensors to choose from.
+        keep: sensors in every set.
+        exclude: sensors in no set.
         noise: of the sensors.
-        logs: motion for which information is computed; if empty, random motion in the scenario's states.
-        prior: (12 L,), prior standard deviation of the parameters about the nominal ones, 0 where they are known.
+        logs: motion for the information; if empty, random motion in the scenario's states.
+        prior: (12 L,), prior standard deviation of the parameters, 0 where they are known.
         criterion: one of `CRITERIA`.
         seed: of random postures and motion.
     """
@@ -332,11 +334,11 @@ class PlanningProblem:
 
 @dataclass(frozen=True)
 class PartPlan:
-    """A part of the robot that can be planned on its own.
+    """Plan of an independent part of the robot.
 
-    `frames`: its contacts. `sets`: all its minimal sets, in which no sensor is redundant; None if there are too many
-    candidates to enumerate. `ranked`: the cheapest of them with their information [bits], most informative first; if
-    they were not enumerated, the one that was found.
+    `frames`: its contacts. `sets`: all its minimal (irredundant) sets; None with too many candidates to enumerate.
+    `ranked`: the cheapest of them with their information [bits], most informative first; or the single set that was
+    found.
     """
 
     frames: tuple[str, ...]
@@ -377,10 +379,10 @@ class Branch:
 
 @dataclass(frozen=True)
 class ContactRequirement:
-    """A group of contacts that share joints, and the sensors with which the base survives the projection.
+    """A group of contacts that share joints, and the sensors that keep the base observable.
 
-    `joints`: between the base and the contacts. `branches`: names of the branches these belong to. `fewest_readings`:
-    the fewest joint torques and contact components that meet this group's demand alone, a lower bound if not `proven`.
+    `joints`: between the base and the contacts. `branches`: names of the branches of these joints. `fewest_readings`:
+    least number of joint torques and contact components for this group alone, a lower bound if not `proven`.
     """
 
     contacts: tuple[str, ...]
@@ -392,15 +394,18 @@ class ContactRequirement:
 
 @dataclass(frozen=True)
 class SensorPlan:
-    """The recommended sensors of a scenario, with the reasons.
+    """Recommended sensors of a scenario, with the reasons.
 
     Attributes:
-        problem: that they solve.
-        chosen: the recommended set. Its `cost` is the least possible if `proven`; `lower_bound`: no set costs less.
+        problem: the planning problem.
+        chosen: the recommended set.
+        cost: of the set; the least possible if `proven`.
+        lower_bound: no set costs less.
         parts: independent parts. The minimal sets of the robot are the unions of one set of each part.
-        branches: chains of joints, and which of them contacts constrain; `requirements`: of every group of contacts.
-        observability: of the base with the recommended set, state by state.
-        stack_rank, stack_full: rank of the stack of samples with it, and with all candidates.
+        branches: chains of joints, and whether contacts constrain them.
+        requirements: of every group of contacts.
+        observability: of the base with the recommended set, by contact state.
+        stack_rank, stack_full: rank of the stacked samples with the set, and with all candidates.
         removals: ranks without each of its sensors.
     """
 
@@ -424,16 +429,16 @@ class SensorPlan:
 
 
 def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None) -> SensorPlan:
-    """The cheapest sensor set for a scenario, and of these the most informative one, with the reasons.
+    """Find the cheapest sensor set for a scenario; among equally cheap sets, the most informative one.
 
     Raises:
-        SensorError: the candidates do not suffice, or a criterion that does not fit the robot.
+        SensorError: the candidates do not suffice, or the criterion does not fit the robot.
     """
     report = progress or (lambda *_: None)
     if problem.criterion not in CRITERIA:
         raise SensorError("sensors", "criterion", f"'{problem.criterion}'", ", ".join(CRITERIA))
     if problem.criterion == "per_sample" and problem.robot.fixed_base:
-        raise SensorError("sensors", "criterion", "per_sample, which needs a floating base", "stack")
+        raise SensorError("sensors", "criterion", "per_sample, but the robot has a fixed base", "stack")
     parts: tuple[PartPlan, ...] = ()
     if problem.criterion == "stack":
         done = _counted(report, "leaving sensors out", len(problem.candidates))

@@ -85,18 +85,19 @@ def all_minimal_sets(
     keep: Iterable[Candidate] = (),
     exclude: Iterable[Candidate] = (),
 ) -> list[tuple[Candidate, ...]] | None:
-    """Every minimal sufficient set: without any one of its candidates, except kept ones, it does not suffice.
+    """Every minimal sufficient set: one that does not suffice without any one of its candidates, except kept ones.
 
-    For the demands and candidates of one `DemandGroup`: the sets of a robot are all unions of one set of each group.
+    Use it for the demands and candidates of one `DemandGroup`. The minimal sets of a robot are all unions of one set of
+    each group.
 
     Args:
         demands: to be met.
         candidates: to choose from.
         keep: in every set.
-        exclude: in none.
+        exclude: in no set.
 
     Returns:
-        The sets by size; None of more than `_MOST_FREE` candidates, kept ones aside.
+        The sets by size; None for more than `_MOST_FREE` candidates that are not kept.
 
     Raises:
         SensorError: as `_usable_candidates`.
@@ -123,15 +124,15 @@ def all_minimal_sets(
 def _usable_candidates(
     demands: Sequence[Demand], candidates: Sequence[Candidate], keep: Iterable[Candidate], exclude: Iterable[Candidate]
 ) -> tuple[frozenset[Candidate], tuple[Candidate, ...]]:
-    """The kept candidates, and all that are not excluded after a check that these suffice.
+    """The kept candidates, and all that are not excluded, after a check that these suffice.
 
     Raises:
-        SensorError: they do not suffice, or one is both kept and excluded.
+        SensorError: they do not suffice, or a candidate is both kept and excluded.
     """
     kept = frozenset(keep)
     excluded = frozenset(exclude)
     for contradiction in kept & excluded:
-        raise SensorError("sensors", "keep", f"'{contradiction.name}', which is also excluded", "one or the other")
+        raise SensorError("sensors", "keep", f"'{contradiction.name}' is also in exclude", "one of the two")
     usable = tuple(c for c in candidates if c not in excluded)
     lacking = [
         f"{missing} of {demand.target.shape[1]} dimensions of {' + '.join(demand.frames)}"
@@ -139,10 +140,9 @@ def _usable_candidates(
         if (missing := demand.missing(usable))
     ]
     if lacking:
-        reason = f"all of them leave {'; '.join(lacking)} undetermined"
-        raise SensorError(
-            "sensors", "candidates", reason, "more candidates: joints on the way there, contact components"
-        )
+        reason = f"all together do not determine {'; '.join(lacking)}"
+        accepted = "more candidates: contact components, or joints between the base and the contact"
+        raise SensorError("sensors", "candidates", reason, accepted)
     return kept, usable
 
 
@@ -198,11 +198,11 @@ def bound_cost(demand: Demand, candidates: Sequence[Candidate]) -> CostBound:
 
 
 def inequalities(demand: Demand, candidates: Sequence[Candidate], chosen: AbstractSet[Candidate]) -> Iterator[Array]:
-    """Valid inequalities on sets that meet the demand, violated by `chosen`, which does not.
+    """Valid inequalities on sets that meet the demand; `chosen`, which does not meet it, violates them.
 
-    Each is from a set F: `chosen`, enlarged as long as it leaves as many dimensions of the target unreached. That
-    gives fewer and smaller weights for the same right-hand side. Candidates that do not act on one of the contacts come
-    first, so that the inequality is about that contact.
+    Each comes from a set F: `chosen`, enlarged as long as the number of missing dimensions does not change. This gives
+    fewer and smaller weights for the same right-hand side. Candidates that do not act on one of the contacts come
+    first, so the inequality concerns that contact.
 
     Yields:
         Rows (n + 1,): weights of the n candidates, then the right-hand side.

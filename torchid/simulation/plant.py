@@ -1,4 +1,4 @@
-"""The simulated robot in MuJoCo: feet on the floor, joints that are held or follow others, closed loops."""
+"""The simulated robot in MuJoCo: feet on the floor, fixed and mimic joints, closed loops."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def point_foot(frame: str, radius: float = 0.0, centre: tuple[float, float, floa
 
 
 def find_feet(settings: list[FootConfig], urdf: Path) -> tuple[Foot, ...]:
-    """The feet with their contact points, from the file or from the URDF's collision spheres.
+    """Feet with their contact points, from the simulation file or from the URDF's collision spheres.
 
     Args:
         settings: of the simulation file.
@@ -93,7 +93,7 @@ def find_feet(settings: list[FootConfig], urdf: Path) -> tuple[Foot, ...]:
         if foot.frame not in links:
             raise UnknownNameError.at_field("feet", foot.frame, links)
         if frames.count(foot.frame) > 1:
-            raise ConfigError.at_field("feet", f"'{foot.frame}' named twice", "every foot once")
+            raise ConfigError.at_field("feet", f"'{foot.frame}' named twice", "each frame once")
         along_normal = foot.sensor == NORMAL_FORCE
         if foot.points:
             points = tuple((x, y, z) for x, y, z in foot.points)
@@ -102,8 +102,8 @@ def find_feet(settings: list[FootConfig], urdf: Path) -> tuple[Foot, ...]:
         shapes = links[foot.frame].findall("collision")
         spheres = [sphere for shape in shapes if (sphere := _sphere(urdf, foot.frame, shape)) is not None]
         if not spheres:
-            missing = f"no points, and {urdf.name} has no collision spheres at {foot.frame}"
-            raise ConfigError.at_field("feet", missing, "points: [[x, y, z], ...] in the frame of the foot")
+            missing = f"{foot.frame} has no points here and no collision spheres in {urdf.name}"
+            raise ConfigError.at_field("feet", missing, "points: [[x, y, z], ...] in the foot's frame [m]")
         points, radii = zip(*spheres, strict=True)
         feet.append(Foot(foot.frame, points, radii, along_normal))
     return tuple(feet)
@@ -126,7 +126,7 @@ def _sphere(urdf: Path, frame: str, shape: object) -> tuple[tuple[float, float, 
 
 
 def form_polygon(points: Array) -> bool:
-    """Whether contact points, (k, 3) [m], form a polygon: do not all lie on a line."""
+    """Whether contact points, (k, 3) [m], span a polygon (do not lie on one line)."""
     return len(points) > 2 and float(np.linalg.svd(points - points.mean(axis=0))[1][1]) > _NARROWEST
 
 
@@ -138,14 +138,14 @@ _STIFFEST = 0.9999  # share of a violation's acceleration that MuJoCo's constrai
 
 @dataclass(frozen=True)
 class JointConstraints:
-    """What keeps joints of a robot from moving one by one.
+    """Constraints between the joints of a robot.
 
     Attributes:
-        held: position of joints that do not move, by name [rad or m].
-        mimics: of joints that follow another one, by name.
+        held: position of fixed joints, by name [rad or m].
+        mimics: of mimic joints, by name.
         loops: pairs of frames that coincide.
-        inertials: parameters (10,) in place of those that the file has, of links by name: what a held joint carries
-            can be known together with what carries it alone.
+        inertials: parameters (10,) that replace those of the file, by link; a fixed joint may have moved mass between
+            links.
     """
 
     held: Mapping[str, float] = field(default_factory=dict)
@@ -161,7 +161,7 @@ class JointConstraints:
         loops: Sequence[Loop] = (),
         held: Mapping[str, float] | None = None,
     ) -> JointConstraints:
-        """Those of a robot's file, with its joints, and of loops and held joints that a run has."""
+        """Constraints of a robot's file, and of a run's loops and fixed joints."""
         held = held or {}
         mimics = {
             name: mimic for name, mimic in resolve_mimics(path, joints).items() if mimic.master and name not in held
@@ -169,7 +169,7 @@ class JointConstraints:
         return cls(held, mimics, loops)
 
     def add_to(self, spec: mujoco.MjSpec, physics_hz: float) -> None:
-        """Constrain joints of a model, as stiffly as its steps allow; held joints are no joints any more."""
+        """Constrain joints of a model as stiffly as its time step allows; fixed joints are removed."""
         for link, values in self.inertials.items():
             set_inertial(spec.body(body_name(link)), values)
         for name, position in self.held.items():
@@ -199,7 +199,7 @@ def _sites(number: int) -> tuple[str, str]:
 
 
 def _hold(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, position: float) -> None:
-    """Fix a joint of a URDF, whose anchor is its body's origin, at a position [rad or m]."""
+    """Fix a joint of a URDF at a position [rad or m]."""
     body = joint.parent
     axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
     start = Rotation.from_quat(np.array(body.quat), scalar_first=True)
@@ -290,7 +290,7 @@ _SLIP_RATIO = 10.0  # friction's stiffness over the normal one's: soft friction 
 
 @dataclass(frozen=True)
 class FootMotion:
-    """Where the middle of a foot's points is: position (3,), velocity (6,), Jacobian (6, nv), bias acceleration (6,).
+    """Motion of the middle of a foot's points: position (3,), velocity (6,), Jacobian (6, nv), bias acceleration (6,).
 
     World axes, linear part first; `rotation`, (3, 3), is that of the foot's frame to world.
     """
@@ -302,9 +302,9 @@ class FootMotion:
     bias: Array
 
     def rolling(self, radius: float) -> FootMotion:
-        """The motion of the material point below the middle of a sphere that rolls on the floor.
+        """Motion of the material point below the middle of a sphere that rolls on the floor.
 
-        Its linear bias is that of v + omega x l with l fixed in the world, as the floor's next material point needs.
+        Its linear bias is that of v + omega x l with l fixed in the world.
         """
         J = self.J.copy()
         bias = self.bias.copy()
@@ -336,13 +336,13 @@ class Plant:
 
         Args:
             urdf: the robot; its shapes are not used.
-            feet: what touches the floor.
+            feet: that touch the floor.
             physics_hz: integration rate [Hz].
-            friction: Coulomb [N m] and viscous [N m s/rad] friction of every joint; None: the URDF's.
-            stated: joints that are held or without a motor, and loops beside the file's.
+            friction: Coulomb [N m] and viscous [N m s/rad] friction of every joint; None for the URDF's.
+            stated: fixed joints, joints without a motor, and loops besides those of the file.
 
         Raises:
-            UrdfError: MuJoCo does not take it, or it has springs.
+            UrdfError: MuJoCo does not accept the robot, or it has springs.
             ConfigError: see `weld_positions` and `passive_joints`.
         """
         stated = stated or ConstrainedRobot()
@@ -394,7 +394,7 @@ class Plant:
         mujoco.mj_step1(self.model, self.data)
 
     def push(self, torque: Array) -> None:
-        """Apply joint torques (n,) [N m], work out accelerations and contact forces, and integrate one step."""
+        """Apply joint torques (n,) [N m], compute accelerations and contact forces, and integrate one step."""
         self.data.qfrc_applied[6:] = torque
         mujoco.mj_step2(self.model, self.data)
 
@@ -417,7 +417,7 @@ class Plant:
 
     @property
     def unstable(self) -> bool:
-        """Whether the integration has diverged (MuJoCo then starts afresh)."""
+        """Whether the integration has diverged (MuJoCo then restarts from the initial state)."""
         return any(warning.number for warning in self.data.warning)
 
     @property
@@ -482,11 +482,11 @@ class Plant:
 
 
 def _add_armatures(model: mujoco.MjModel, path: Path, joints: Sequence[TreeJoint]) -> None:
-    """Give joints the armatures of an MJCF file, which `plain_urdf` loses; UrdfError of springs, which it loses too."""
+    """Add the armatures of an MJCF file to joints, because `plain_urdf` drops them. UrdfError for springs."""
     for joint in joints:
         if joint.stiffness:
-            reason = f"a spring of stiffness {joint.stiffness:g}"
-            raise UrdfError(path, f"joint '{joint.name}'", reason, "joints without springs, for a simulation")
+            reason = f"has a spring of stiffness {joint.stiffness:g}"
+            raise UrdfError(path, f"joint '{joint.name}'", reason, "joints without springs, to simulate")
         if joint.armature:
             model.dof_armature[model.joint(joint.name).dofadr] = joint.armature
 
@@ -498,10 +498,10 @@ def compile_model(
     floating: bool = True,
     constraints: JointConstraints | None = None,
 ) -> mujoco.MjModel:
-    """MuJoCo's model of a URDF robot without shapes, on a soft floor that its feet alone touch, without joint stops.
+    """MuJoCo model of a URDF robot without shapes and joint limits, on a soft floor that only its feet touch.
 
     Raises:
-        UrdfError: MuJoCo does not take it.
+        UrdfError: MuJoCo does not accept the robot.
     """
     spec = _spec(urdf)
     if constraints is not None:
@@ -553,9 +553,9 @@ def _spec(urdf: Path) -> mujoco.MjSpec:
 
 
 def _lumped_inertials(urdf: Path) -> dict[str, Array]:
-    """Parameters (10,) of every link with what is welded to it, 0 of what is welded to another.
+    """Parameters (10,) of every link including the links welded to it, 0 for the welded ones.
 
-    MuJoCo checks links one by one: of a body that can exist, those of a camera or a foot often cannot.
+    MuJoCo checks links one by one. A body may be consistent although its single links (a camera, a foot) are not.
     """
     links, joints = read_urdf(urdf)
     fixed = {joint.child: joint for joint in joints if joint.type == "fixed"}
@@ -571,20 +571,19 @@ def _lumped_inertials(urdf: Path) -> dict[str, Array]:
 
 
 def _refusal(urdf: Path, spec: mujoco.MjSpec, message: str) -> UrdfError:
-    """What is wrong with a model that MuJoCo does not take, of a link's inertia without MuJoCo's words."""
+    """Error for a model that MuJoCo does not accept; for a link's inertia in our own words."""
     named = re.search(r"inertia.*Element name '([^']+)'", message, re.DOTALL)
     body = spec.body(named[1]) if named else None
     if named is None or body is None:
         return UrdfError(urdf, file_kind(urdf), f"MuJoCo refuses it: {message}", _SIMULATED)
     if "mjMINVAL" in message:
         joint = body.joints[0].name if body.joints else ""
-        held = f", or robot.weld: {{{joint}: 0}}, which holds it still" if joint else ""
+        held = f", or robot.weld: {{{joint}: 0}} to fix the joint" if joint else ""
         accepted = f"an <inertial> of the link{held}"
-        return UrdfError(urdf, f"link '{named[1]}'", "moves without mass or without inertia", accepted)
-    reason = "with what is welded to it, an inertia that no body has"
-    return UrdfError(
-        urdf, f"link '{named[1]}'", reason, "principal moments A, B, C above 0, none above the others' sum"
-    )
+        return UrdfError(urdf, f"link '{named[1]}'", "moves, but has no mass or no inertia", accepted)
+    reason = "with the links welded to it, its inertia is not physically consistent"
+    accepted = "principal moments above 0, none above the sum of the other two"
+    return UrdfError(urdf, f"link '{named[1]}'", reason, accepted)
 
 
 def _carries_mass(body: mujoco.MjsBody) -> bool:
@@ -593,7 +592,7 @@ def _carries_mass(body: mujoco.MjsBody) -> bool:
 
 
 def _add_foot(spec: mujoco.MjSpec, foot: Foot) -> None:
-    """A massless plate welded to the link: all that touches the floor, and a six-axis sensor in the weld."""
+    """Add a massless plate, welded to the link, with the contact spheres and a six-axis sensor."""
     plate = spec.body(foot.frame).add_body(name=foot_site(foot))
     plate.add_site(name=foot_site(foot))
     plate.add_site(name=_middle(foot), pos=foot.middle)

@@ -1,4 +1,4 @@
-"""A log's joint torques on a simulated robot, in windows that each begin at the log's state, and how far it drifts."""
+"""Replay of a log's joint torques on a simulated robot, in windows that start at the log's state, and the drift."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _MOST_WINDOWS = 500
 
 @dataclass(frozen=True)
 class ReplayedLog:
-    """What is replayed of a log of N samples.
+    """The replayed part of a log with N samples.
 
     Attributes:
         source: its name.
         time: (N,) [s].
         position, velocity: (N, n), of the joints [rad or m, rad/s or m/s].
         torque: (N, n), of the joints [N m or N].
-        quat_xyzw: (N, 4), base to world; None of a fixed base that stands upright.
-        angular_velocity: (N, 3), of the base in its own axes [rad/s]; None of a fixed one.
+        quat_xyzw: (N, 4), base to world; None for an upright fixed base.
+        angular_velocity: (N, 3), of the base in its own axes [rad/s]; None for a fixed base.
         active: (N, F) bool, which feet stand on the floor.
     """
 
@@ -47,18 +47,18 @@ class ReplayedLog:
     active: np.ndarray
 
     def windows(self, length: float) -> Array:
-        """Where windows begin and end, (W, 2) int, one after the other, evenly chosen if they are too many.
+        """Successive windows, (W, 2) int: begin and end; evenly chosen if there are too many.
 
         Args:
             length: of each [s].
 
         Raises:
-            LogError: the log has none without a gap, in which a floating base stands at the beginning, or they would be
+            LogError: the log has no window without a gap that begins with standing feet (floating base), or windows are
                 shorter than two samples.
         """
         interval = float(np.median(np.diff(self.time)))
         if length < _FEWEST * interval:
-            accepted = f"at least {_FEWEST * interval:.3g} s, {_FEWEST} sampling intervals"
+            accepted = f"at least {_FEWEST * interval:.3g} s ({_FEWEST} sampling intervals)"
             raise LogError(self.source, "time", f"windows of {length:g} s", accepted)
         gaps = np.cumsum(np.diff(self.time, prepend=self.time[0]) > _LONGEST_GAP * interval)
         stands = np.full(len(self.time), self.angular_velocity is None) | self.active.any(axis=1)
@@ -76,25 +76,25 @@ class ReplayedLog:
             else:
                 begin += 1
         if not spans:
-            accepted = "a shorter window, or a longer log" + ("" if stands.all() else " of a robot that stands")
-            raise LogError(self.source, "time", f"no {length:g} s without a gap", accepted)
+            accepted = "a shorter window, or a longer log" + ("" if stands.all() else " with standing feet")
+            raise LogError(self.source, "time", f"has no window of {length:g} s without a gap", accepted)
         chosen = np.linspace(0, len(spans) - 1, min(len(spans), _MOST_WINDOWS)).round().astype(int)
         return np.array(spans)[chosen]
 
 
 @dataclass(frozen=True)
 class Model:
-    """A robot as it is simulated: a URDF and what a URDF cannot say of its n joints.
+    """A robot to simulate: a URDF and, for its n joints, what a URDF cannot contain.
 
     Attributes:
         urdf: with inertia, damping and friction.
         joints: names of the n joints.
         armature: (n,), reflected rotor inertia [kg m^2 or kg].
         offset: (n,), subtracted from the joints' torques [N m or N].
-        stiffness: (n,), of springs that are at rest at position 0 [N m/rad or N/m].
-        stribeck: (n,), friction at rest beyond the file's [N m or N]; empty without any.
-        stribeck_velocity: over which that drops [rad/s or m/s].
-        constraints: what keeps joints of the file from moving one by one.
+        stiffness: (n,), of springs with rest position 0 [N m/rad or N/m].
+        stribeck: (n,), static friction beyond that of the file [N m or N]; empty without.
+        stribeck_velocity: of this friction [rad/s or m/s].
+        constraints: between the joints.
     """
 
     urdf: Path
@@ -109,12 +109,12 @@ class Model:
 
 @dataclass(frozen=True)
 class Drift:
-    """How far a simulated robot is from the log, after T times in W windows.
+    """Deviation of a simulated robot from the log, after T times in W windows.
 
     Attributes:
-        time: (T,) since the beginning of a window [s].
-        joints: (W, T, n), position of the joints less that of the log [rad or m].
-        tilt: (W, T), angle between the base's orientations [rad]; None of a fixed base.
+        time: (T,) since the begin of a window [s].
+        joints: (W, T, n), simulated minus logged joint position [rad or m].
+        tilt: (W, T), angle between the base orientations [rad]; None for a fixed base.
     """
 
     time: Array
@@ -135,25 +135,26 @@ def replay_log(
     progress: Callable[[int], None] | None = None,
     gains: Array | None = None,
 ) -> Drift:
-    """Drive a robot with a log's torques, linear between samples, from the log's state at the beginning of each window.
+    """Drive a simulated robot with a log's torques, in windows that start at the log's state.
 
-    With gains kp and kd the torques are those of a PD law with the targets that made those of the log: to a torque tau
-    at position q and velocity v of the log come kp (q - q_sim) + kd (v - v_sim) of the simulated robot.
+    Torques are linear between samples. With gains kp and kd the robot has a PD controller with the targets that
+    produced the log's torques: the simulated torque is tau + kp (q - q_sim) + kd (v - v_sim), for the torque tau,
+    position q and velocity v of the log.
 
-    A floating base begins where the lowest of its standing feet touches a level floor, with the velocity that leaves
+    A floating base starts where the lowest of its standing feet touches a level floor, with the velocity that keeps
     them still.
 
     Args:
         model: the robot.
         log: the log.
-        feet: what stands on the floor, in the order of `log.active`; not used for a fixed base.
+        feet: in the order of `log.active`; not used for a fixed base.
         windows: (W, 2) int, from `ReplayedLog.windows`.
-        times: (T,) since the beginning of a window at which the drift is wanted [s], ascending.
+        times: (T,) since the begin of a window, for the drift [s], ascending.
         progress: called with the number of windows done.
         gains: kp [N m/rad or N/m] and kd [N m s/rad or N s/m] of each joint, (2, n); None for 0.
 
     Raises:
-        UrdfError: MuJoCo does not take the robot.
+        UrdfError: MuJoCo does not accept the robot.
         InputError: an armature is negative.
     """
     kp, kd = np.zeros((2, len(model.joints))) if gains is None else gains
@@ -184,7 +185,7 @@ class _Simulated:
     def __init__(self, model: Model, feet: Sequence[Foot], log: ReplayedLog) -> None:
         for name, value in zip(model.joints, model.armature, strict=True):
             if value < 0.0:
-                reason = f"{value:.3g} kg m^2, which MuJoCo would not take"
+                reason = f"{value:.3g} kg m^2; MuJoCo accepts no negative armature"
                 raise InputError(model.urdf.parent, f"armature of {name}", reason, "estimator.name=consistent")
         self.log = log
         self.floating = log.angular_velocity is not None
@@ -205,7 +206,7 @@ class _Simulated:
         self.followers = Followers(self.model, model.constraints.mimics)
 
     def add_gains(self, kp: Array, kd: Array) -> None:
-        """Let joints be pulled to position 0 and velocity 0, (n,) each, as by springs and dampers."""
+        """Pull joints to position 0 and velocity 0 by springs and dampers, (n,) each."""
         self.model.jnt_stiffness[self.model.dof_jntid[self.rate]] += kp
         self.model.dof_damping[self.rate] += kd
         fastest = float((self.model.dof_damping * self.model.dof_invweight0).max(initial=0.0))

@@ -1,4 +1,4 @@
-"""Simulated motions: a stance, reference and controller, an exact recording, how it stood, what its sensors read."""
+"""Simulated motions: stance, reference and controller, exact recording, stability, and sensor readings."""
 
 from __future__ import annotations
 
@@ -54,16 +54,16 @@ class Stance:
 
 
 def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]) -> Stance:
-    """Put the robot on its feet, its base level and its centre of mass over their middle, close to a posture.
+    """Put the robot on its feet near a posture, with a level base and the centre of mass above the middle of the feet.
 
     Args:
-        plant: the robot; left in the stance.
-        feet: what it stands on.
-        posture: joint positions by name [rad or m]; others are 0, or the end of their range nearest to it.
+        plant: the robot; it is left in the stance.
+        feet: that stand.
+        posture: joint positions by name [rad or m]; others are 0, or the nearest limit.
 
     Raises:
-        UnknownNameError: a joint that the robot does not have.
-        InputError: a joint beyond its limits, or no such configuration near the posture.
+        UnknownNameError: the robot has no such joint.
+        InputError: a joint is beyond its limits, or there is no such configuration near the posture.
     """
     for name in posture:
         if name not in plant.joint_names:
@@ -72,7 +72,7 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
     for name, value in posture.items():
         joint = plant.joint_names.index(name)
         if not low[joint] <= value <= high[joint]:
-            accepted = f"{low[joint]:g} to {high[joint]:g}, the joint's limits"
+            accepted = f"{low[joint]:g} to {high[joint]:g} (the joint's limits)"
             raise InputError.at_field(f"posture.{name}", f"{value:g}", accepted)
     joints = np.clip([posture.get(name, 0.0) for name in plant.joint_names], low, high)
     plant.place(np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 0.0], joints]))
@@ -96,8 +96,8 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
     _, off = _tasks(plant, feet, targets, rotations)
     if not np.abs(off).max() < _TOLERANCE:
         worst = np.abs(off).max()
-        reason = f"no stance near it with all feet on the floor and the base level: off by {worst:.2g} m or rad"
-        raise InputError.at_field("posture", reason, "joint positions, by name, in which the robot nearly stands")
+        reason = f"not near a stance with all feet on the floor and a level base (off by {worst:.2g} m or rad)"
+        raise InputError.at_field("posture", reason, "joint positions by name, close to a standing posture")
     return Stance(plant.position.copy(), plant.com.copy(), targets, rotations)
 
 
@@ -126,8 +126,8 @@ def _flattened(R: Array, foot: Foot) -> Array:
     axis = np.cross(normal, [0.0, 0.0, 1.0])
     angle = np.arctan2(np.linalg.norm(axis), normal[2])
     if angle > _STEEPEST:
-        reason = f"{foot.frame} is {np.degrees(angle):.0f} degrees off the horizontal"
-        raise InputError.at_field("posture", reason, f"joint positions that put it within {np.degrees(_STEEPEST):.0f}")
+        reason = f"{foot.frame} is {np.degrees(angle):.0f} deg off the horizontal"
+        raise InputError.at_field("posture", reason, f"joint positions with at most {np.degrees(_STEEPEST):.0f} deg")
     return Rotation.from_rotvec(angle * axis / max(float(np.linalg.norm(axis)), 1e-12)).as_matrix() @ R
 
 
@@ -160,7 +160,7 @@ class Controller:
     def __init__(
         self, plant: Plant, feet: tuple[Foot, ...], rotations: Array, friction: tuple[float, float] = (0.0, 0.0)
     ) -> None:
-        """Fix the feet, their rotations to world, (F, 3, 3), which they keep, and the joint friction to make up for."""
+        """Set the feet, their constant rotations to world, (F, 3, 3), and the joint friction to compensate."""
         self._plant = plant
         self._coulomb, self._viscous = friction
         self._feet = feet
@@ -181,7 +181,7 @@ class Controller:
         return joints if plant.has_motor.all() else self._of_motors(joints)
 
     def _of_motors(self, needed: Array) -> Array:
-        """Torques (n,) that do what others would, (n,), where some joints have no motor: constraints exert the rest."""
+        """Torques (n,) of the motors that replace torques (n,) of all joints; constraints transmit the rest."""
         motors = np.flatnonzero(self._plant.has_motor)
         J, _, _ = self._plant.constraints
         exerted = np.concatenate([np.eye(len(needed))[:, motors], J[:, 6:].T], axis=1)
@@ -246,9 +246,9 @@ class Controller:
         return np.asarray(position + radius * np.cross(turned, [0.0, 0.0, 1.0]))
 
     def _contact_forces(self, base: Array, load: Array, feet: list[FootMotion]) -> Array:
-        """Generalized force (nv,) of the smallest point forces that give the base what it needs, (6,).
+        """Generalized force (nv,) of the smallest point forces that give the base a required wrench, (6,).
 
-        Points that would have to pull on the floor are dropped, as far as enough others remain.
+        Points that would have to pull on the floor are dropped, as long as enough others remain.
         """
         maps = []
         shares = []
@@ -310,7 +310,7 @@ class ReferenceMotion:
         self._stance = stance
         names = (*BODY, *joint_names)
         if config.duration_s * control_hz < 2.0:
-            accepted = f"at least two control steps, {2.0 / control_hz:g} s"
+            accepted = f"at least {2.0 / control_hz:g} s (two control steps)"
             raise InputError.at_field(f"motions.{config.name}.duration_s", f"{config.duration_s:g}", accepted)
         steps = round((LEAD_S + config.duration_s) * control_hz)
         self.time = np.arange(steps) / control_hz - LEAD_S
@@ -320,15 +320,15 @@ class ReferenceMotion:
             if wave.what not in names:
                 raise UnknownNameError.at_field(f"motions.{config.name}.waves.{index}.what", wave.what, names)
             if wave.hz >= 0.5 * control_hz:
-                accepted = f"below {0.5 * control_hz:g}, half of control_hz"
+                accepted = f"below {0.5 * control_hz:g} (half of control_hz)"
                 raise InputError.at_field(f"motions.{config.name}.waves.{index}.hz", f"{wave.hz:g}", accepted)
             sine = np.sin(2.0 * np.pi * (wave.hz * self.time + wave.phase))
             moved[:, names.index(wave.what)] += wave.amplitude * grown * sine
         self._moved = _with_derivatives(moved, control_hz)
         self._driven = np.array([any(wave.what == name for wave in config.waves) for name in joint_names])
         if config.steps and config.steps.swing_s + 2.0 * config.steps.transfer_s > 1.0 / config.steps.hz:
-            reason = f"{config.steps.swing_s:g} in the air and twice {config.steps.transfer_s:g} to transfer the load"
-            accepted = f"at most the period of {1.0 / config.steps.hz:g} s together"
+            reason = f"{config.steps.swing_s:g} s in the air and 2 x {config.steps.transfer_s:g} s to transfer the load"
+            accepted = f"at most {1.0 / config.steps.hz:g} s in sum (1 / steps.hz)"
             raise InputError.at_field(f"motions.{config.name}.steps.swing_s", reason, accepted)
         for frame in config.steps.order if config.steps else ():
             if frame not in feet:
@@ -427,20 +427,20 @@ class Simulation:
     stance: Stance
 
     def require_support(self, support: BoolArray, field: str) -> None:
-        """Require that feet, (F,) bool, can support a robot. Raises InputError: their contact points lie on a line."""
+        """Raise InputError if the contact points of feet, (F,) bool, lie on one line."""
         standing = zip(self.feet, self.stance.feet, self.stance.rotations, support, strict=True)
         points = [middle + foot.arms @ R.T for foot, middle, R, on in standing if on]
         if not points or not form_polygon(np.concatenate(points)):
             names = ", ".join(foot.frame for foot, on in zip(self.feet, support, strict=True) if on)
-            reason = f"stands on {names} alone, whose contact points lie on a line" if names else "no foot on the floor"
-            raise InputError.at_field(field, reason, "three points on the floor that do not, at any time")
+            reason = f"all contact points of {names} lie on one line" if names else "no foot on the floor"
+            raise InputError.at_field(field, reason, "at any time three contact points that form a triangle")
 
     def reference(self, config: MotionConfig) -> ReferenceMotion:
         """The reference of a motion: a setpoint for every control step.
 
         Raises:
-            UnknownNameError: it moves what the robot does not have.
-            InputError: it is too short, or lifts feet that the robot cannot do without.
+            UnknownNameError: the robot does not have what a wave moves.
+            InputError: the motion is too short, or lifts feet that the robot needs.
         """
         plant = self.plant
         hz = self.config.control_hz
@@ -512,7 +512,7 @@ def record(
         if step % report_every == 0:
             if plant.unstable or not abs(plant.position[2] - stance.position[2]) <= config.bounds.height_m:
                 when = f"at {time:.2f} s" if time >= 0.0 else f"{-time:.2f} s before the log begins"
-                accepted = "a gentler motion, or another posture"
+                accepted = "a slower or smaller motion, or another posture"
                 raise InputError.at_field(f"motions.{motion.name}", f"the robot falls {when}", accepted)
             if progress is not None:
                 progress(report_every / config.control_hz)
@@ -571,16 +571,16 @@ class Stability:
     unloaded: tuple[float, ...]
 
     def require_within(self, bounds: BoundsConfig, motion: str) -> None:
-        """Require that the robot stayed within the bounds of standing. Raises InputError: a bound is broken."""
+        """Raise InputError if the robot left the bounds of standing."""
         for measured, allowed in (
-            (f"base height changes by {self.height_change:.3g} m", self.height_change <= bounds.height_m),
+            (f"the base height changes by {self.height_change:.3g} m", self.height_change <= bounds.height_m),
             (f"a foot slips by {1e3 * self.slip:.3g} mm", self.slip <= bounds.slip_m),
-            (f"zero-moment point {1e3 * self.zmp_margin:.3g} mm inside the support", self.zmp_margin >= bounds.zmp_m),
-            (f"a joint passes its limits by {self.beyond_limits:.3g}", self.beyond_limits <= 0.0),
+            (f"the ZMP is {1e3 * self.zmp_margin:.3g} mm inside the support polygon", self.zmp_margin >= bounds.zmp_m),
+            (f"a joint is {self.beyond_limits:.3g} rad or m outside its limits", self.beyond_limits <= 0.0),
             (f"a joint needs {100 * self.effort:.0f} % of its effort limit", self.effort <= 1.0),
         ):
             if not allowed:
-                accepted = "a gentler motion, another posture or wider bounds"
+                accepted = "a slower or smaller motion, another posture or wider bounds"
                 raise InputError.at_field(f"motions.{motion}", measured, accepted)
 
 
@@ -606,8 +606,8 @@ def _measure_stability(simulation: Simulation, recording: Recording) -> Stabilit
     bearing = np.linalg.norm(force, axis=2).max(axis=0)
     for foot, most in zip(feet, bearing, strict=True):
         if most <= load:
-            reason = f"{load:g} N, but {foot.frame} never bears more than {most:.3g} N"
-            accepted = "a fraction of what a standing foot bears"
+            reason = f"{load:g} N, but the force at {foot.frame} is at most {most:.3g} N"
+            accepted = "a fraction of the load on a standing foot"
             raise InputError.at_field("sensors.contact_threshold", reason, accepted)
     low, high = plant.limits.T
     height = _require_field(log, "base_position_world")[:, 2]
@@ -655,20 +655,20 @@ def _zmp_margin(position: Array, force: Array, moment: Array, stance: Stance, fe
 
 
 def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: str | None = None) -> Log:
-    """The log that a robot with imperfect sensors would have written.
+    """The log that a robot with imperfect sensors would record.
 
-    Positions, torques and wrenches only: velocities and accelerations are for the preprocessing to derive. A foot whose
-    exact log has `contact_force_normal` reads this alone. A contact is active while the measured force, of wrenches
-    along its mean over the log, exceeds the threshold.
+    It has positions, torques and wrenches; preprocessing derives velocities and accelerations. A foot with
+    `contact_force_normal` in the exact log has only this reading. A contact is active while the measured force (of
+    wrenches: along its mean over the log) exceeds the threshold.
 
     Args:
         truth: exact log, of a `Recording`.
-        sensors: which imperfections, and how large.
+        sensors: imperfections of the sensors.
         seed: of the noise, together with `name`; biases and gains depend on the seed alone.
         name: of the motion, by default the log's source; becomes the source.
 
     Raises:
-        InputError: a delay of no sample, or of all.
+        InputError: the delay is shorter than one sample or longer than the log.
     """
     name = name or truth.source
     torque = _require_field(truth, "joint_torque")
@@ -677,7 +677,7 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
         step = float(np.median(np.diff(truth.time)))
         late = round(sensors.delay.feet_s / step)
         if late >= len(truth) or (late == 0 and sensors.delay.feet_s > 0.0):
-            accepted = f"0, or from one sample, {step:g} s, to less than the log, {len(truth) * step:g} s"
+            accepted = f"0, or from {step:g} s (one sample) to below {len(truth) * step:g} s (the log)"
             raise InputError(name, "sensors.delay.feet_s", f"{sensors.delay.feet_s:g}", accepted)
         wrench = wrench[np.maximum(np.arange(len(truth)) - late, 0)]  # the first reading is held
     if sensors.bias.enabled:
@@ -752,5 +752,5 @@ def _require_field(log: Log, name: str) -> Array:
     """A field of an exact log, which must have it. Raises LogError: the log lacks it."""
     values: Array | None = getattr(log, name)
     if values is None:
-        raise LogError(log.source, name, "missing", "an exact log that torchid simulate wrote")
+        raise LogError(log.source, name, "missing", "an exact log from torchid simulate")
     return values

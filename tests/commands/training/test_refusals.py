@@ -160,7 +160,7 @@ def test_a_descent_that_diverges_ends_in_one_line_and_is_not_in_the_way_of_the_n
     assert main(command(experiment, output, "estimator.training.optimizer.lr=1e9")) == 2
     printed = capsys.readouterr()
     (line,) = printed.err.splitlines()
-    assert line.startswith("torchid: estimator: training: a loss of ")
+    assert line.startswith("torchid: estimator: training: diverged: loss ")
     assert line.endswith("; accepted: a smaller lr")
     assert printed.out == ""
     assert names_in(output.parent) == ["run.training"]
