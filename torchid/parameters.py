@@ -1,4 +1,4 @@
-"""Order of a body's parameters and of a wrench's components, functions of the parameters, and gravity."""
+"""Order of a body's parameters and of wrench components, functions of the parameters, and gravity."""
 
 from __future__ import annotations
 

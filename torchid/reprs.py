@@ -1,4 +1,4 @@
-"""Representations that say what a thing is, in at most ten lines, however much it holds."""
+"""Short representations (`repr`) of objects, in at most ten lines."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _TEXT = 60  # characters of one value
 
 
 def decimal(value: float) -> str:
-    """A number with three decimals, or with three significant digits if these would be fewer, as of grams in kg."""
+    """A number with three decimals, or with three significant digits if it is small, such as grams in kg."""
     return f"{value:.3g}" if 0.0 < abs(value) < 0.1 else f"{value:.3f}"
 
 
 def short_repr(thing: object) -> str:
-    """The class with its `_headline()`, if it has one, and what its fields hold: numbers, names, shapes.
+    """The class with its `_headline()`, if it has one, and its fields: numbers, names, shapes.
 
     `__repr__ = short_repr` in the body of a class; a dataclass keeps it. What is None or empty is left out.
     """
@@ -38,7 +38,7 @@ def short_repr(thing: object) -> str:
 
 
 def _fields(thing: object, title: str) -> Iterator[str]:
-    """What the fields of a dataclass hold, but texts of the title, and those that are not for a `repr`."""
+    """Fields of a dataclass as text, without texts that are in the title."""
     if not dataclasses.is_dataclass(thing):
         return
     for field in dataclasses.fields(thing):
@@ -50,7 +50,7 @@ def _fields(thing: object, title: str) -> Iterator[str]:
 
 
 def _brief(value: object) -> str:
-    """A value in a few words, "" for one that says nothing."""
+    """A value in a few words, "" for empty ones."""
     if (shape := getattr(value, "shape", None)) is not None and hasattr(value, "dtype"):  # of NumPy or torch
         return str(tuple(shape))
     if value is None or (isinstance(value, (str, Sequence, Mapping, frozenset)) and not len(value)):

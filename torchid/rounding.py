@@ -1,4 +1,4 @@
-"""Numerical practice that packages share: tolerances of rank with what applies them, scales of columns and errors."""
+"""Shared numerical tolerances and the functions that apply them."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 from torchid.parameters import Array
 
 RANK_TOLERANCE = 1e-10
-"""Singular values of rows of data with columns of comparable size: below this share of the largest, rounding."""
+"""Rank tolerance for data with columns of comparable size, relative to the largest singular value."""
 
 KINEMATIC_TOLERANCE = 1e-9
 """The same for contact Jacobians, unit wrenches, and sensor readings projected onto their null spaces."""
 
 BASE_RANK_TOLERANCE = 1e-6
-"""Singular values of parts of orthonormal matrices, such as S_b V_x: below this, they are rounding.
+"""Absolute rank tolerance for parts of orthonormal matrices, such as S_b V_x.
 
 Axes that are 4e-6 from parallel, by the rounded angles (1.5708) of a URDF, count as independent.
 """
@@ -32,7 +32,7 @@ STD_PER_MAD = 1.4826
 
 
 def column_scale(A: Array) -> Array:
-    """What makes the columns of A, (R, n), of norm 1, (n,); 0 for columns of zeros."""
+    """Factors that scale the columns of A, (R, n), to norm 1, (n,); 0 for columns of zeros."""
     norms = np.linalg.norm(A, axis=0)
     return np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0.0)
 

@@ -46,7 +46,7 @@ def _file_name(value: str) -> str:
 
 
 def described(accepted: str) -> WrapValidator:
-    """What a type accepts, in messages about its values, whatever pydantic would say of its parts."""
+    """State what a type accepts, in place of pydantic's own message."""
 
     def validate(value: object, handler: ValidatorFunctionWrapHandler) -> object:
         try:
@@ -58,31 +58,31 @@ def described(accepted: str) -> WrapValidator:
 
 
 STRICT = ConfigDict(extra="forbid")
-"""Of blocks of settings: a key that is none is refused."""
+"""For blocks of settings: unknown keys are refused."""
 
 AUTO: Literal["auto"] = "auto"
-"""A value that the data choose."""
+"""The data choose the value."""
 
 Number = Annotated[float, BeforeValidator(_not_bool), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
 Auto = Literal["auto"]
 PositiveOrAuto = Annotated[Positive | Auto | None, described("auto, null, or a number greater than 0")]
-"""A positive number, one that the data choose, or none."""
+"""A positive number, a number chosen by the data, or none."""
 NumberOrAuto = Annotated[Number | Auto | None, described("auto, null, or a number")]
-"""A number, one that the data choose, or none."""
+"""A number, a number chosen by the data, or none."""
 NotNegative = Annotated[Number, Field(ge=0.0)]
 BoolOrAuto = Annotated[bool | Auto, described("true, false, or auto")]
-"""A switch, or one that the data set."""
+"""A switch, or a choice of the data."""
 NotNegativeOrAuto = Annotated[NotNegative | Auto, described("auto, or a number of at least 0")]
-"""A number that is not negative, or one that the data choose."""
+"""A number of at least 0, or a number chosen by the data."""
 NotNegativeAutoOrNone = Annotated[NotNegative | Auto | None, described("auto, null, or a number of at least 0")]
-"""A number that is not negative, one that the data choose, or none."""
+"""A number of at least 0, a number chosen by the data, or none."""
 FileName = Annotated[str, AfterValidator(_file_name)]
 Device = Annotated[str, AfterValidator(_torch_device)]
 RidgeRule = Literal["auto", "one_standard_error"]
-"""Which ridge is chosen: the first unless a larger one predicts better, or the largest within one standard error."""
+"""Rule for the ridge: the first unless a larger one predicts better, or the largest within one standard error."""
 Ridge = Annotated[NotNegative | RidgeRule, described("auto, one_standard_error, or a number of at least 0")]
-"""A ridge, or how one is chosen."""
+"""A ridge, or a rule for it."""
 BelowOne = Annotated[Number, Field(ge=0.0, lt=1.0)]
 Tolerance = Annotated[Number, Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, BeforeValidator(_not_bool), Field(ge=1)]

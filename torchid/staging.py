@@ -1,4 +1,4 @@
-"""Results appear whole or not at all: written to a hidden folder beside their place, which a rename ends."""
+"""Write results completely or not at all: into a hidden folder, then rename it."""
 
 from __future__ import annotations
 

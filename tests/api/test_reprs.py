@@ -112,7 +112,7 @@ def test_no_repr_is_longer_than_ten_lines(things: Mapping[str, object]) -> None:
         ("regressor", "13 bodies, 12 joints, 18 rows of K"),
         ("problem", "for 156 parameters (154 free)"),
         ("estimate", "Estimate: rank 118 of 156 parameters (79 identified, "),
-        ("base parameters", "118 combinations of 154 free parameters"),
+        ("base parameters", "118 base parameters from 156 parameters (154 free)"),
         ("batches", "MiniBatches: 1250 samples of 1 log"),
         ("trainer", "Trainer: epoch 0 of 3"),
         ("identification", "Identification of quadruped.urdf, 13 bodies, 12 joints, by consistent"),

@@ -138,7 +138,7 @@ REFUSED = {
     "a scenario with an unknown frame": ({"scenarios": {"stand": [["paw"]]}}, "analysis.scenarios.stand", "'paw'"),
     "no scenario": ({"scenarios": {}}, "analysis.scenarios", "an empty mapping"),
     "a scenario without states": ({"scenarios": {"stand": []}}, "analysis.scenarios.stand", "an empty list"),
-    "a scenario that is no file name": ({"scenarios": {"a/b": [[]]}}, "analysis.scenarios.a/b:", "a name of letters"),
+    "a scenario that is no file name": ({"scenarios": {"a/b": [[]]}}, "analysis.scenarios.a/b:", "a name of at most"),
     "scenarios without names": ({"scenarios": [[[]]]}, "analysis.scenarios", "accepted: a mapping"),
     "a kept sensor that is no candidate": ({"keep": ["knee"]}, "analysis.keep", "'knee'"),
     "an excluded sensor that is no candidate": ({"exclude": ["front_left_foot.fx"]}, "analysis.exclude", "foot.fx'"),

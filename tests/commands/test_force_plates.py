@@ -107,7 +107,7 @@ def test_plates_without_a_pose_in_their_world_are_refused(tmp_path: Path, capsys
     velocity = np.gradient(value(walk(2.0).base_position_world), walk(2.0).time, axis=0)
     np.savez(tmp_path / "motion.npz", base_linear_velocity_world=velocity, **rest)
     complaint = refusal(["identify", str(experiment(tmp_path, MOTION, text))], tmp_path, capsys)
-    assert "contact_wrench_point_world: given without base_position_world" in complaint
+    assert "contact_wrench_point_world: moments about the world's origin need base_position_world" in complaint
 
 
 @pytest.mark.slow("a recording of a person")

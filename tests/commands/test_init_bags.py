@@ -109,7 +109,7 @@ def test_a_go2s_orientation_lets_its_feet_roll_and_turned_frames_are_refused(tmp
     config, reader = read[0]
     (samples,) = reader.read(config.logs.train, None)
     assert samples.base.quat_xyzw is not None
-    with pytest.raises(LogError, match=r"base_quat_xyzw: missing, though FL_foot \(radius 0.022 m\) rolls"):
+    with pytest.raises(LogError, match=r"base_quat_xyzw: missing, but FL_foot \(radius 0.022 m\) needs the"):
         read[1][1].read(read[1][0].logs.train, None)
     turned = ["logs.topics.low_state.frame=radar"]
     with pytest.raises(ConfigError, match=r"low_state\.frame: 'radar' is rotated by 165 deg relative to base"):

@@ -108,7 +108,7 @@ def test_a_urdf_that_contradicts_its_own_shapes_is_warned_of(tmp_path: Path) -> 
         conditions(tmp_path, robot, com_inside="ellipsoid", com_shapes="collision")
     (message,) = (str(warning.message) for warning in caught)
     assert message.startswith("experiment.yaml: estimator.com_inside: the centre of mass of the URDF is outside the")
-    assert "ellipsoid at left_ankle_roll_link, right_ankle_roll_link; " in message
+    assert "ellipsoid of left_ankle_roll_link, right_ankle_roll_link. Check" in message
     assert conditions(tmp_path, robot, com_inside="ellipsoid").enclosures
 
 

@@ -175,7 +175,9 @@ def test_what_no_frame_can_be_found_by_is_refused_in_one_line(tmp_path: Path) ->
     robot, contacts = robot_of(BIPED), BIPED.contacts
     log = about_worlds_origin(walk())
     lost = preprocess(replace(log, base_linear_acceleration_world=np.zeros((len(log), 3)), base_position_world=None))
-    message = refused(lambda: bind_log(lost, robot, contacts), "biped: contact_wrench_point_world: given without base_")
+    message = refused(
+        lambda: bind_log(lost, robot, contacts), "biped: contact_wrench_point_world: moments about the world"
+    )
     assert "base_position_world and the base's orientation, or moments" in message
     points = [Contact(foot, "point") for foot in BIPED.feet]
     assert bind_log(lost, robot, points).base.position is None  # no moment is read

@@ -102,7 +102,11 @@ def test_what_cannot_be_zeroed_is_refused() -> None:
     standing[:, 1] = True
     said("contact_wrench_local: 0 readings of r_foot in the air", contact_active=standing)
     said("contact_wrench_local: 0 readings of l_foot in the air", contact_active=np.ones_like(active))
-    line = said("contact_wrench_world: given with", contact_wrench_local=None, contact_wrench_world=wrench)
+    line = said(
+        "contact_wrench_world: preprocessing.zero_in_air needs wrenches in the sensor's frame",
+        contact_wrench_local=None,
+        contact_wrench_world=wrench,
+    )
     assert "contact_wrench_point_world or logs.columns.plates" in line
     plate = {"contact_wrench_local": None, "contact_wrench_world": silent, "moments_about_world_origin": True}
     said("contact_wrench_world: 0 readings of l_foot in the air", **plate)

@@ -155,7 +155,7 @@ def test_a_robot_that_falls_is_refused_in_one_line(folder: Path, capsys: pytest.
 
 def test_a_robot_that_keeps_standing_but_not_within_the_bounds_is_refused(folder: Path) -> None:
     edit(folder, {"bounds": {"zmp_m": 0.5}})
-    with pytest.raises(InputError, match="sim.yaml: motions.m: zero-moment point .* wider bounds"):
+    with pytest.raises(InputError, match="sim.yaml: motions.m: the ZMP is .* wider bounds"):
         simulated(folder / "sim.yaml")
 
 

@@ -481,7 +481,7 @@ _MOST_SLACK = 0.01  # bound of the slack in phase I
 # at rows of a starting point, and moves to get there
 _ROOM = 0.1
 _MOVES = 3
-_SHORTEST = 1e-6  # least share of a step: below, rounding decides about feasibility
+_SHORTEST = 1e-6  # least fraction of a step; below, rounding decides about feasibility
 
 
 @one_thread()
@@ -581,7 +581,7 @@ _SHARE = 0.98  # of the longest step that stays inside
 _CENTRE_SHRINK = 0.1  # of the barrier's weight from step to step towards a point of the central path
 _CENTRED_CHANGE = 1e-9  # relative, of blocks and slacks, in the last of these steps
 _SHORT = 0.2  # length of a corrected step below which a plain one is taken
-_ACCURATE = 1e-9  # complementarity, relative to the objective, from which on the gap itself is computed
+_ACCURATE = 1e-9  # relative complementarity below which the gap itself is computed
 _CENTRED = 0.5
 
 
@@ -726,7 +726,7 @@ class PrimalDual:
         shrunk = (1.0 - min(1.0, self._longest(point, Z_root, affine))) ** 3 * kappa
         move = solve(shrunk, _symmetric(affine.blocks @ affine.Z), affine.slack * affine.y)
         length = min(1.0, _SHARE * self._longest(point, Z_root, move))
-        if length < _SHORT:  # far from the path, where the corrections mislead: back to a point of it that is as far
+        if length < _SHORT:  # far from the path, where the corrections mislead: back to the path
             promised = -float(self.problem.gradient(point.x.numpy()) @ affine.x.numpy())
             move = solve(max(kappa, promised / max(self.problem.degree, 1)), none, none)
             length = min(1.0, _SHARE * self._longest(point, Z_root, move))

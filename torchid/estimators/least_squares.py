@@ -27,7 +27,7 @@ UNOBSERVABLE = "unobservable"
 FIXED = "fixed"
 VERDICTS = (IDENTIFIED, PRIOR, COMBINED, UNOBSERVABLE, FIXED)
 
-_OBSERVABLE = 1e-12  # squared share in the row space: that of a finger in a sum with the trunk's mass is 1e-7
+_OBSERVABLE = 1e-12  # squared component in the row space; a finger in a sum with the trunk's mass has 1e-7
 
 
 @dataclass(frozen=True)

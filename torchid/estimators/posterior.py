@@ -20,9 +20,9 @@ from torchid.reprs import short_repr
 from torchid.rounding import RANK_TOLERANCE, is_significant
 
 PRIOR_ERROR = 0.2
-"""Default standard deviation of the nominal parameters, as a share of each body."""
+"""Default standard deviation of the nominal parameters, relative to each body."""
 
-_LEAST_NOISE = 1e-8  # of rows without any, as a share of the rms of the right-hand side
+_LEAST_NOISE = 1e-8  # of rows without noise, relative to the rms of the right-hand side
 _THINNEST = 1e-4  # least eigenvalue of the scaled pseudo-inertias that the prior is relative to
 
 
@@ -165,9 +165,9 @@ def _widen(covariance: Array, weights: Array, least: float) -> None:
         covariance += (least - variance) / variance**2 * np.outer(along, along)
 
 
-_WIDTHS = np.geomspace(0.01, 10.0, 300)  # errors of nominal bodies that are considered, as shares of them, 2.3 % each
-_LEVEL = 1e-3  # share of robots whose files are as wrong as the prior says, and that are called otherwise
-_MUCH = 1.5  # times the prior's width: less changes ranges little
+_WIDTHS = np.geomspace(0.01, 10.0, 300)  # relative errors of nominal bodies to consider, in steps of 2.3 %
+_LEVEL = 1e-3  # significance level
+_MUCH = 1.5  # times the prior's width; smaller factors hardly change the ranges
 
 
 @dataclass(frozen=True)

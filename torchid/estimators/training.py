@@ -227,7 +227,7 @@ def _groups(base_rows: int, nv: int, rows: int) -> dict[str, slice]:
 
 
 CONVERGED = 0.01
-"""Share of the least objective that one of a converged descent is above it at most."""
+"""Largest relative excess of a converged descent over the least objective."""
 _BETTER = 1e-5  # least relative decrease that counts as an improvement
 _DIVERGED = 1e6  # times the loss at the nominal parameters, or that of the stated noise if that is larger
 

@@ -18,10 +18,10 @@ from torchid.parameters import Array
 from torchid.problem.chunks import worker_count
 
 UPPER = np.triu_indices(4)
-"""Rows and columns of the ten entries that a symmetric (4, 4) matrix is held in."""
+"""Rows and columns of the ten stored entries of a symmetric (4, 4) matrix."""
 
 ENTRY_WEIGHTS = np.where(UPPER[0] == UPPER[1], 1.0, 2.0)
-"""How often each of them is in the matrix, (10,)."""
+"""Number of times each stored entry is in the matrix, (10,)."""
 
 CURVATURE = 0.25
 """Share of the barrier's Hessian in that of the Gaussian.
@@ -30,7 +30,7 @@ With all of it chains reach the tails too seldom: 40 000 draws of an exponential
 small. With a quarter it is within 1 %, for as many passes.
 """
 
-_RARE = 0.01  # share of draws that a condition excludes, above which it counts as near
+_RARE = 0.01  # a condition that excludes a larger fraction of draws counts as near
 _DRAWS = 400
 _PASSES = 6
 
@@ -146,12 +146,12 @@ def _gaussian_at(conic: ConicProblem, mean: Array, near: np.ndarray) -> BarrierG
     return BarrierGaussian(mean, root, directions, blocks, rows, near)
 
 
-_CHAINS = 512  # that find out how many passes make a state new
+_CHAINS = 512  # to measure how many passes make a state independent
 _TRIES = (3, 6, 15)  # on an ellipse, at once, after which a chain stays where it is; each halves the arc
 _INSIDE = 1e-12  # least pivot of a block and slack of a row, relative to the mean's: above what rounding can hide
-_ALIKE = 0.25  # correlation of a coordinate with what it was, in all chains, below which states count as new
+_ALIKE = 0.25  # correlation of a coordinate with its start below which states count as independent
 _MOST = 200  # passes after which moves of pairs count as too slow
-_BURN_IN = 4  # times as many passes as make states new, before the first is used
+_BURN_IN = 4  # times the passes that make a state independent, before the first sample
 # of draws from the Gaussian that are outside, towards its mean
 _SHRINK = 0.8
 _SHRINKS = 200

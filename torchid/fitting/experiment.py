@@ -167,7 +167,7 @@ def _fitting(names: Collection[str], pattern: str) -> bool:
     return any(fits(name, pattern) for name in names)
 
 
-_ALONG = 0.01  # rad, up to which an IMU's frame is along the base's axes
+_ALONG = 0.01  # rad, accepted angle between an IMU's frame and the base axes
 
 
 def require_maps_of(robot: Robot, logs: LogsConfig) -> None:

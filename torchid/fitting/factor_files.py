@@ -92,7 +92,7 @@ class RowModel:
             "actuators.sign_width": tree.sign_width,
             "columns": builder.width,
         }
-        if robot.welded:  # a factor of a robot without stays what it was
+        if robot.welded:  # only then, to keep older files valid
             settings["robot.weld"] = [f"{name} at {position!r}" for name, position in robot.welded.items()]
         if robot.loops:
             settings["robot.loops"] = [f"{loop.kind} of {loop.label}" for loop in robot.loops]
@@ -103,7 +103,7 @@ class RowModel:
         if any(robot.base_tilt):
             settings["robot.base_tilt"] = ", ".join(map(repr, robot.base_tilt))
         for name in ("armature", "stiffness", "spring_torque"):
-            if (stated := getattr(robot, name)).any():  # of an MJCF robot, taken off the right-hand side
+            if (stated := getattr(robot, name)).any():  # of an MJCF robot, subtracted from the right-hand side
                 settings[f"robot.mjcf {name}"] = [repr(float(x)) for x in stated]
         settings |= {f"preprocessing.{name}": value for name, value in preprocessing.items()}
         geometry = {
@@ -157,7 +157,7 @@ def require_same_noise(path: object, actual: RowModel, expected: RowModel, refer
 
 def _contact_text(contact: Contact) -> str:
     kind = f"line along {contact.line_axis}" if contact.kind == "line" else contact.kind
-    if contact.radius:  # a factor of a contact that does not roll stays what it was
+    if contact.radius:  # only then, to keep older files valid
         kind += f", radius {contact.radius!r} m, normal {', '.join(map(repr, contact.normal))}"
     if any(contact.centre):
         kind += f", centre {', '.join(map(repr, contact.centre))} m"
@@ -303,7 +303,7 @@ class _PartReader:
 
 
 FORMAT = 4
-"""Version of the format, a whole number that grows whenever a reader of an older version would be wrong."""
+"""Version of the format; it increases if older readers would misread a file."""
 
 _ACCEPTED = f"a complete {FACTORS} file from torchid compress"
 _GEOMETRY = ("T_parent_joint", "T_joint_link", "joint_map", "joint_constant", "contact_node", "T_node_contact")
@@ -545,7 +545,7 @@ _APART = (
     "exclude_rejected",
     "memory_gb",
 )
-"""Keys of preprocessing that do not change what a row is."""
+"""Keys of preprocessing that do not change the meaning of a row."""
 
 
 def row_model(experiment: Experiment, builder: RowBuilder) -> RowModel:
@@ -557,7 +557,7 @@ def row_model(experiment: Experiment, builder: RowBuilder) -> RowModel:
         "actuators.delay": actuators.known_delay,
         "actuators.stiction": actuators.known["stiction"],
     }
-    added: dict[str, Value] = {name: x for name, x in known.items() if x}  # a factor without stays what it was
+    added: dict[str, Value] = {name: x for name, x in known.items() if x}  # only then, to keep older files valid
     return replace(model, settings=model.settings | added) if added else model
 
 

@@ -45,7 +45,7 @@ from torchid.reprs import short_repr
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE
 
-_TURNS = 10  # of fit and noise of readings; they settle in three or four
+_TURNS = 10  # of fit and noise of readings; three or four suffice
 _SETTLED = 0.02
 _LEAST_SCALE = 0.1
 
@@ -427,7 +427,7 @@ def calibration_at(assembly: Assembly, minimizer: Minimizer, robot: Robot, build
     return Calibration(robot=robot, builder=builder, phi=minimizer.phi, values=values)
 
 
-# sensors or bodies that a warning names, and the answer of a run
+# number of sensors or bodies in a warning, and in the answer of a run
 _NAMED = 6
 _NAMED_IN_SHORT = 2
 

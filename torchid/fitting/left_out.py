@@ -44,27 +44,27 @@ from torchid.sensing.sensors import recorded_components
 from torchid.settings import RidgeRule
 
 TERMS = ("armature", "torque_offset", "delay", "stiffness", "asymmetric_coulomb")
-"""Terms of actuators that logs choose, the more usual first: of two that explain the same the first is kept."""
+"""Actuator terms that logs choose from; of two that explain the same, the first is kept."""
 
 RIDGE = 0.1
-"""Weight of the prior in the mean squared residual: what the model lacks does not average out in a longer log.
+"""Weight of the prior in the mean squared residual: model errors do not average out in a longer log.
 
 Of 1e-3, 1e-2, 0.1 and 1 the one that predicts strangers' logs best, or within 3 % of the best (`docs/estimators.md`).
 """
 
 SAMPLES = 6000
-"""Samples of all logs, evenly spaced, that choices are made with."""
+"""Number of evenly spaced samples of all logs for choices."""
 
 _BLOCKS = 20
 _FOLDS = 5
 _LEAST_PER_BLOCK = 10  # independent samples
-_CHANCE = 0.005  # that a block-by-block difference of nothing seems to be one
-_GAIN = 0.1  # decrease of the squared error, at least: gains 2 % off let springs and offsets reach 0.05 where none are
-_OF_TERMS = 0.01  # weight of the prior where terms are chosen: with more, those would make up for bodies
-_WORSE = 0.1  # increase of the product of squared errors of two readings that fitting the wider one may cost
-_EXACT = 1e-14  # share of the squared forces below which residuals are rounding
-_WEAK = 1e-3  # weight of the prior of extra parameters, by that of bodies
-_BODIES = 0.2  # deviation of bodies from their file that costs as much as a standard deviation of a gain
+_CHANCE = 0.005  # probability that a difference between blocks is only chance
+_GAIN = 0.1  # least decrease of the squared error: gain errors of 2 % let absent springs and offsets reach 0.05
+_OF_TERMS = 0.01  # weight of the prior for the choice of terms: with more, terms would replace body parameters
+_WORSE = 0.1  # accepted increase of the product of squared errors for the wider reading
+_EXACT = 1e-14  # fraction of the squared forces; smaller residuals are rounding
+_WEAK = 1e-3  # weight of the prior of extra parameters, relative to that of bodies
+_BODIES = 0.2  # deviation of bodies that costs as much as one standard deviation of a gain
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Reading:
             unit[count + number, k] = self.extras[number].size
         prior = np.repeat([weight, _WEAK * weight], [self.spread.shape[1], len(fitted)])
         gains = np.array([bool(self.gain) and self.extras[number].what == "scale" for number in fitted], dtype=bool)
-        if gains.any():  # one that all share is another robot's mass
+        if gains.any():  # a common one means another mass of the robot
             about_mean = np.eye(gains.sum()) - 1.0 / gains.sum()
             unit[np.ix_(count + np.array([*fitted])[gains], gains)] = self.gain / _BODIES * about_mean
             prior[self.spread.shape[1] :][gains] = weight
@@ -418,7 +418,7 @@ def widest(readings: Sequence[Reading], terms: Collection[str]) -> int:
         readings: of the same blocks, the widest first.
         terms: kinds of the fitted extra parameters.
     """
-    # a filter that takes off twice the noise also makes twice as many samples say the same: the prior weighs alike
+    # a filter that halves the noise also halves the independent samples: the weight of the prior does not change
     ridges = [RIDGE * reading.oversampling / readings[0].oversampling for reading in readings]
     squares = [reading.left_out(terms, None, ridge) for reading, ridge in zip(readings, ridges, strict=True)]
     for number, reading in enumerate(readings[:-1]):
@@ -483,7 +483,7 @@ RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
 """Ridges that are tried, in decades: finer steps change predictions by less than their spread over the folds."""
 
 STRONGER = (1.0, 10.0, 100.0)
-"""Multiples of the ridge by the size of the residuals that are tried."""
+"""Multiples of the ridge (from the size of the residuals) to try."""
 
 MOST_SCORED = 100_000
 ENOUGH_SCORED = 10_000

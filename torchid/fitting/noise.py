@@ -39,7 +39,7 @@ from torchid.sensing import Contact, SensorNoise, SensorSet
 _SETTLED = 0.05  # change of the deviation along any group's directions: weights 10 % off cost 0.2 % of efficiency
 _PASSES = 6
 _DIGITS = 3
-_APART = 2.0  # where a standard deviation is half of what it should be, 95 % intervals hold the truth in 67 %
+_APART = 2.0  # with half of the true standard deviation, 95 % intervals contain the truth in 67 %
 
 
 @dataclass(frozen=True)
@@ -237,17 +237,17 @@ def _suggested(rows: SampledRows, tied: Sequence[str], free: GroupVariances) -> 
     return groups.settings({key: getattr(shown, key) for key in whole})
 
 
-_MUCH = 1.5  # times the residual that noise leaves; stated noise is seldom known better
-_ALIKE = 2.0  # times the blocks' part of the residuals if these were noise, which alone gives 0.8 to 1.3
-_EXACT = 1e-6  # of what the nominal parameters leave: signals without noise, of which rounding is left
+_MUCH = 1.5  # times the expected residual; stated noise is seldom known better
+_ALIKE = 2.0  # lack of fit; white residuals give 0.8 to 1.3
+_EXACT = 1e-6  # fraction of the nominal residual; below, only rounding remains
 _NAMED = 3
 
 _UNEXPLAINED = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
-_SHARE = 0.5  # and of the weighted forces, where the noise was estimated to be as large; recorded logs stay below 0.35
+_SHARE = 0.5  # fraction of the weighted forces, for estimated noise; recorded logs stay below 0.35
 _JOINT_SHARE = 0.4  # of the torque of one joint: a gear of half the ratio leaves 0.5
-_SMALL_SHARE = 0.05  # of the torques of all joints: what flexibility, filters and friction's shape leave of any
+_SMALL_SHARE = 0.05  # fraction of all joint torques: flexibility, filters and the shape of friction
 AT_THE_FLOOR = 1.3
-"""Errors up to which noise of the readings may be all that is left, over what it leaves."""
+"""Errors up to this multiple of the noise floor may be pure sensor noise."""
 
 
 @dataclass(frozen=True)
@@ -388,7 +388,7 @@ def _residual(estimate: Estimate) -> float:
     return float(np.sqrt(estimate.cost / max(estimate.rows, 1)))
 
 
-_CLEAR = 0.5  # correlation of forces of the URDF's bodies with the measured ones, from which on their factor is clear
+_CLEAR = 0.5  # least correlation of the URDF's forces with the measured ones for a clear factor
 
 
 @one_thread()
@@ -447,8 +447,8 @@ def unexplained_joints(fitted: Metrics) -> list[str]:
     return [name for name, (error, measured) in torques.items() if error > max(_JOINT_SHARE * measured, least)]
 
 
-_LEVEL = 1e-3  # share of fits without such friction that show some
-_FRICTION_RATIO = 2.0  # times the squares that it would explain of noise, at least: noise is not known better
+_LEVEL = 1e-3  # significance level
+_FRICTION_RATIO = 2.0  # least ratio to the squares explained by noise, which is not known better
 _UNITS = {"prismatic": ("N", "N s/m")}
 _ROTARY = ("N m", "N m s/rad")
 _NAMED_JOINTS = 2

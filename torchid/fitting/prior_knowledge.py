@@ -155,7 +155,7 @@ They have no part along it (see `with_known_masses`), so that the weight matters
 """
 
 _LEAST_NOISE = 0.1
-"""Of whitened rows: those of exact data, beside which a scale would count for nothing, have 1e-12."""
+"""Least noise of whitened rows. Exact data have 1e-12, beside which a weighed mass would not count."""
 
 
 @dataclass(frozen=True)

@@ -31,24 +31,24 @@ from torchid.problem.extras import SLOPE, dof_extra_column
 
 EARLIEST_DELAY = -0.02
 LATEST_DELAY = 0.06
-"""Delays that are tried [s]: beyond, the stamps are those of another clock."""
+"""Search range of delays [s]; beyond, the stamps come from another clock."""
 
 LARGEST_TILT = 0.3
-"""Largest tilt about each axis that is tried [rad]: more is another frame than was meant."""
+"""Search range of the tilt about each axis [rad]; more means another frame."""
 
 _DELAYS = np.linspace(EARLIEST_DELAY, LATEST_DELAY, 17)  # [s]
 _WIDTHS = tuple(10.0 ** np.arange(-2.0, 0.25, 0.25))  # [rad/s or m/s]
 _VELOCITIES = tuple(10.0 ** np.arange(-2.0, 1.25, 0.25))  # [rad/s or m/s], of Stribeck friction
 _RADII = (0.0, 0.015, 0.03, 0.045)  # [m] of balls about the frames of feet
-_FIRST_WIDTHS = (0.01, 0.1)  # [rad/s or m/s]: where neither predicts better than the sign, no width is looked for
+_FIRST_WIDTHS = (0.01, 0.1)  # [rad/s or m/s]; if neither predicts better than the sign, the search stops
 
 # of all logs, evenly spaced
 _DELAY_TRIAL_SAMPLES = 1000
 _TILT_SAMPLES = 2000
 _SAMPLES = 5000
-_WIDTH_GAIN = 0.05  # decrease of the squared error that a width is worth: no body can make up for it
-_TILT_GAIN = 1e-3  # of the residual, by which a tilt has to beat none
-_RIDGE = 1e-6  # the residual is smooth in the setting where the data determine some parameters badly
+_WIDTH_GAIN = 0.05  # least decrease of the squared error for a width
+_TILT_GAIN = 1e-3  # least relative decrease of the residual for a tilt
+_RIDGE = 1e-6  # makes the residual a smooth function of the setting
 # of Gauss and Newton; in standard errors
 _MAX_STEPS = 8
 _SETTLED_STEP = 1e-2
@@ -56,7 +56,7 @@ _SETTLED_STEP = 1e-2
 _TILT_SETTLED = 1e-6
 _WIDTH_SETTLED = 1e-3
 _LOG_VELOCITY_STEP = 1e-3  # of differences
-_AT_REST_CHANCE = 0.025  # that friction at rest of any joint seems to be beyond Coulomb friction
+_AT_REST_CHANCE = 0.025  # probability of apparent static friction by chance
 _AT_END = "the end of the search range"
 _QUANTILE = 1.96  # standard errors from the middle to the end of a 95 % interval
 
@@ -414,7 +414,7 @@ def choose_sign_width(read: Callable[[float | None], Reading], kinds: Sequence[s
     residual = {width: std for width, (std, _) in errors_of.items()}
     best = min(residual, key=lambda width: residual[width])
     width = next(x for x in tried if not Evidence.of(errors_of[x][1], errors_of[best][1]).certain)
-    if width == best and width is not None:  # no other does as well
+    if width == best and width is not None:  # the best is the only candidate
         place = _WIDTHS.index(width)
         bounds = np.log10([_WIDTHS[max(place - 1, 0)], _WIDTHS[min(place + 1, len(_WIDTHS) - 1)]])
         options = {"xatol": _WIDTH_SETTLED}

@@ -36,12 +36,12 @@ _CONVERGED = 0.03  # rms change of the predicted rows, in their standard errors
 _STEADY = 0.02  # relative change of the scale, whose histogram has bins of 1.2 %
 _EXACT = 1e-11  # of the predicted rows: less is rounding
 _TINY = float(np.finfo(float).tiny)
-_ROUGH_SAMPLES = 5000  # evenly spaced, at least, that a fit of longer logs starts from: 2 passes over all are left
+_ROUGH_SAMPLES = 5000  # least number of evenly spaced samples for the start of a fit to longer logs
 # one in so many, unless they are more than so many
 _ROUGH_STEP = 8
 _MOST_ROUGH = 50_000
 _LEAST_ROUGH = 200  # of them in each log, which may have unknowns of its own
-_WORTHWHILE = 4  # times as many samples, from which on that saves more than it costs
+_WORTHWHILE = 4  # logs this many times longer are worth such a start
 _START = 3  # passes with Huber's loss before Tukey's
 _FARTHEST = 1.9  # steps of weighted least squares, a majorizer of the loss: any below 2 makes that smaller
 

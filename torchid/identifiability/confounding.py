@@ -27,7 +27,7 @@ It is a variance inflation of 100, ten times what is commonly taken for serious 
 Welsch, "Regression Diagnostics", 1980.
 """
 
-_BY_MASS = 0.9  # share of a variance that a known total mass would take off, from which on it is named
+_BY_MASS = 0.9  # a known total mass is named if it would remove this fraction of a variance
 _NAMED = 4  # parameters, at most, in a message
 
 
@@ -339,7 +339,7 @@ def _names(free: np.ndarray, body_names: Sequence[str]) -> list[str]:
 
 
 LEAST_BLOCKS = 3
-"""With fewer blocks their scatter says nothing: of two, 95 % of Student's t reach to 12.7 standard errors."""
+"""Fewer blocks give no useful scatter: with two, a 95 % interval of Student's t is 12.7 standard errors wide."""
 
 _LEAST_JUDGED = 8
 """With fewer blocks residuals that are alike within them are not told from noise, whose variance they hardly know."""

@@ -25,15 +25,15 @@ FEET = "three point feet, one flat foot, or a line foot and another foot"
 """Feet that determine the pose of the base, in messages."""
 
 FEWEST_POINTS = 3
-"""Points that say how a floor lies."""
+"""Points that determine a floor."""
 
-_POSES_TOGETHER = 4096  # samples for which the poses of all links are worked out at once
-_MAX_UNEVEN_M = 0.005  # rms distance from one floor that is worth a warning: of four feet, one is 2 cm off
-_HEADING_TOLERANCE = 0.02  # of a recorded normal's components against the stated one
-_HALF_FOOT_M = 0.05  # a flat foot counts as the corners of a square, a line as two points, so far from its origin
-_MIN_BREADTH = 0.05  # over the length of the feet that stand; below, noise of one tilts the base 20 times more
-_ALONG = 0.8  # cosine of the angle between an axis of a flat foot's frame and the way up to the base: 37 degrees
-_PASSES = 50  # at most; of feet that roll each leaves some hundredth of the error before
+_POSES_TOGETHER = 4096  # samples per computation of link poses
+_MAX_UNEVEN_M = 0.005  # rms distance from a plane that gives a warning: one of four feet is 2 cm off
+_HEADING_TOLERANCE = 0.02  # accepted error of a recorded normal's components
+_HALF_FOOT_M = 0.05  # distance of a foot's points from its origin: corners of a square, or two points of a line
+_MIN_BREADTH = 0.05  # breadth over length of the standing feet; below, noise tilts the base 20 times more
+_ALONG = 0.8  # cosine of the largest angle (37 deg) between a flat foot's axis and the direction to the base
+_PASSES = 50  # at most; each pass reduces the error of rolling feet to about a hundredth
 _SETTLED_M = 1e-13
 
 

@@ -19,8 +19,8 @@ from torchid.problem.metrics import predict_forces, with_payload_columns
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 
-_CHUNK = 1024  # samples whose rows are computed together: a single batch would lose to dispatch
-_MEMORY = 2**30  # [bytes] of rows that are cached from epoch to epoch
+_CHUNK = 1024  # samples whose rows are computed together; smaller chunks have too much overhead
+_MEMORY = 2**30  # [bytes] of cached rows
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class MiniBatches:
         self._memory_left = memory
 
     def __repr__(self) -> str:
-        return f"MiniBatches: {self.samples} samples from {len(self._logs)} logs, {self.batch_size} per batch"
+        return f"MiniBatches: {self.samples} samples of {len(self._logs)} logs, {self.batch_size} per batch"
 
     def epoch(self, number: int) -> Iterator[Batch]:
         """All samples in the order of an epoch, numbered from 1."""
@@ -175,7 +175,7 @@ class MiniBatches:
                     chosen = samples[where]
                     share = chosen[(rank - before) % size :: size]
                     before += len(chosen)
-                    if len(share) or not parts:  # of a chunk with fewer samples than processes at least the shapes
+                    if len(share) or not parts:  # a chunk with fewer samples than processes needs at least the shapes
                         parts.append(self._batch(share if len(share) else chosen[:1], state)[: len(share)])
         return Batch(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Batch)))
 

@@ -28,14 +28,14 @@ ProgressCallback = Callable[[int], None]
 """Called with the number of samples, or of other steps, done since the last call."""
 
 CHUNK = 4096
-"""Samples per chunk: fewer lose to dispatch, and to workers' waits for Python's lock; more to memory traffic."""
+"""Samples per chunk: fewer cost overhead and waits for Python's lock, more cost memory traffic."""
 
 _LEAST = 2048  # samples per chunk where there are fewer than `_EACH` chunks for each worker
 _EACH = 4
-_LET_GO = 4  # chunks of a worker, after which pages that samples are mapped to leave the memory of the process
-_WORTH_LOADING = 200_000  # samples of a pass: kernels take 0.4 s to load and save 2.6 to 6 us of each on two cores
-_MOST_ON_GPU = 64 * CHUNK  # samples per chunk: launching the work on one takes the host 12 ms, whatever its size
-_SHARE_OF_GPU = 8  # a chunk takes one of so many parts of a GPU's memory
+_LET_GO = 4  # chunks of a worker, after which it releases the mapped pages of the samples
+_WORTH_LOADING = 200_000  # samples: kernels take 0.4 s to load and save 2.6 to 6 us per sample on two cores
+_MOST_ON_GPU = 64 * CHUNK  # samples per chunk: a launch takes the host 12 ms for any size
+_SHARE_OF_GPU = 8  # a chunk takes at most this fraction (1 / 8) of a GPU's memory
 _ON_GPU = 48 * 2**10  # bytes of a sample
 
 
@@ -99,7 +99,7 @@ def choose_kernels(builder: RowBuilder, samples: int) -> None:
         builder.compiled = None
     elif builder.compiled is None:
         try:
-            from torchid.problem.compiled_rows import CompiledRows  # loads what shorter logs do without
+            from torchid.problem.compiled_rows import CompiledRows  # slow to import, and not needed for short logs
         except (ImportError, RuntimeError) as error:
             warn(f"Numba does not load ({excerpt(str(error))}). Compression runs without it and takes twice as long")
             return
@@ -313,7 +313,7 @@ def upload(chunks: Iterable[tuple[Samples, Label]], device: torch.device) -> Ite
     for samples, label, copied in one_ahead(map(copy, chunks)):
         working = torch.cuda.current_stream(device)
         working.wait_event(copied)
-        samples.keep_for(working)  # else its memory would be taken for a later copy while it is worked on
+        samples.keep_for(working)  # otherwise a later copy could reuse its memory during the computation
         yield samples, label
 
 

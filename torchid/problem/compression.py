@@ -32,19 +32,19 @@ FOLDS = 5
 """Number of cross-validation folds of the training samples."""
 
 LEAST_PER_FOLD = 20
-"""Independent samples per fold: the filter correlates only a small part of these with neighbours."""
+"""Independent samples per fold, so that the filter correlates only a small part of them with neighbours."""
 
 BLOCKS = 20
-"""Number of blocks of the training samples whose scatter gives standard errors, at least where there are so many."""
+"""Smallest number of training blocks for standard errors from their scatter, if there are enough samples."""
 
 _LEAST_PER_BLOCK = 10  # independent samples
 _FACTOR_BYTES = 2**30  # of the factors of all parts
 
 BY_FOLD = ("source", "fold", "unloaded")
-"""Fields of `Part` that `merge` leaves the contact states and blocks of each fold together by."""
+"""Fields of `Part` for `merge` that join the contact states and blocks of each fold."""
 
 SampleSpan = tuple[int, int]
-"""First of some successive samples of a log, and the end."""
+"""First sample and end of successive samples of a log."""
 
 
 @dataclass
@@ -439,7 +439,7 @@ class CompressedBlock:
 
 
 Block = Samples | CompressedBlock
-"""Samples of one log in one fold, or what they compress to."""
+"""Samples of one log in one fold, or their compressed form."""
 
 
 def piece_spans(samples: int, blocks: int) -> list[SampleSpan]:

@@ -43,23 +43,23 @@ from torchid.rounding import STD_PER_MAD
 from torchid.sensing import Contact, named_sensors
 from torchid.settings import STRICT, NotNegative, Positive
 
-_SUPPORTED = 0.25  # of the weight: what contact forces may leave of it in samples that parameters are fitted to
+_SUPPORTED = 0.25  # fraction of the weight that contact forces may not balance in samples for the fit
 _LEAST_FITTED = 100  # samples
-_DEVIATIONS = 3.0  # of what feet seem to carry in the air, to which thresholds go down
+_DEVIATIONS = 3.0  # of the apparent load of feet in the air: lower limit of the thresholds
 _LOWEST = 0.01  # of the stated thresholds
 _FITS = 3  # of parameters, at most
-_LESS = 0.9  # share of what feet seem to carry in the air that each fit leaves, or it is the last
-_DAMPING = 1e-3  # of actuators' terms, against the share that samples have of them
-_LARGEST = 1.0, 100.0, 100.0  # armature [kg m^2] and friction [N m, N m s/rad] that nothing determines
-_SIGN_WIDTH = 0.001  # rad/s, of friction's sign where none is stated: what rests has none
-_FITTED = 4000  # samples, at least half of them, from which actuators' terms are worked out
-_TOGETHER = 2048  # samples whose forces are solved for at once
-_JOINT_SHARE = 0.1  # errors of the URDF and of friction, of the largest torque's rms
-_BASE_SHARE = 1.0  # the same, of the weight
-_LEVER_M = 0.3  # arm of the base's moments for a force of the size of its errors
-_FREE = 10.0  # standard deviation of a contact force that nothing determines, in weights
+_LESS = 0.9  # a further fit must reduce the apparent load of feet in the air to this fraction
+_DAMPING = 1e-3  # of actuator terms, relative to their information in the samples
+_LARGEST = 1.0, 100.0, 100.0  # bounds of undetermined armature [kg m^2] and friction [N m, N m s/rad]
+_SIGN_WIDTH = 0.001  # rad/s, default width of friction's sign, so that joints at rest have no friction
+_FITTED = 4000  # samples (at least half of them) for the fit of actuator terms
+_TOGETHER = 2048  # samples per solve
+_JOINT_SHARE = 0.1  # errors of the URDF and of friction, as a fraction of the largest torque's rms
+_BASE_SHARE = 1.0  # the same, as a fraction of the weight
+_LEVER_M = 0.3  # lever arm of the errors of the base moment
+_FREE = 10.0  # standard deviation of an undetermined contact force, in weights
 _RATE_SHARE = 0.2  # of the sample rate: highest cutoff
-_MAX_GAPS = 0.05  # share of a torque's samples that may be missing, and are interpolated
+_MAX_GAPS = 0.05  # fraction of missing torque samples that are interpolated
 _FEWEST_TORQUES = 3  # above a contact, one for each component of a force
 
 
@@ -405,7 +405,7 @@ def prepare(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: floa
     if log.joint_torque is None:
         raise LogError(log.source, "joint_torque", "missing", "the field; preprocessing.detect_contacts needs it")
     is_filtered = cutoff_hz < (1.0 - JITTER) * nyquist_hz(log.time)
-    with warnings.catch_warnings():  # noise and gaps are warned of where the log is read for its own sake
+    with warnings.catch_warnings():  # the reader of the log already warns about noise and gaps
         warnings.simplefilter("ignore", TorchidWarning)
         known = preprocess(_for_detection(log), cutoff_hz if is_filtered else None)
     order = joint_order(known, robot)

@@ -24,14 +24,14 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
 
 LEAST_LIMIT = 0.02
-"""Limit [m/s] that is chosen at least: soft ground creeps by millimetres, and a filter leaves some of an impact."""
+"""Smallest chosen limit [m/s], because soft ground creeps and a filter spreads impacts."""
 
-_NOISES = 6.0  # standard deviations of a stance's velocity, by axis, that are noise
+_NOISES = 6.0  # standard deviations of a stance's velocity, per axis, that count as noise
 _MEDIAN_SPEED = 1.538  # of a velocity whose three components have unit variance (Maxwell distribution)
 _STENCIL = 3.0  # steps that a derivative looks to each side
-_TOGETHER = 2048  # samples whose velocities are worked out at once
-_STILL = 0.01  # m/s below which a contact always keeps still: what soft ground and filters leave of a stance
-_STILL_MEDIANS = 2.0  # of the speed of contacts that surely stand, which is noise
+_TOGETHER = 2048  # samples per computation of velocities
+_STILL = 0.01  # m/s; below, a contact does not move (soft ground, filter)
+_STILL_MEDIANS = 2.0  # times the median speed of certain contacts, which is noise
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ class LoopRows:
         return self.geometry.forces(tree, screw_axes, at_base, self.dofs)
 
 
-_DETERMINED = 1e-6  # share of a Jacobian's size: a motor moves the passive joints if no more of its column is left
+_DETERMINED = 1e-6  # largest relative residual of a Jacobian column that a motor determines
 
 
 @dataclass(frozen=True)

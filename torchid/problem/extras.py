@@ -23,11 +23,10 @@ CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_m
 """Kinds of sensor channels, as `SensorNoise` has them."""
 
 SLOPE = "slope"
-"""Kind of the further unknown of a search, which no fit has: how far a setting is off, such as a delay, to first order.
-"""
+"""Kind of the unknown of a search: the error of a setting, such as a delay, to first order."""
 
 ScaleGroups = Sequence[Sequence[str]]
-"""Groups of sensors that share a scale of all logs: patterns of the names of joints or frames, as `fits` has them."""
+"""Groups of sensors with a common scale for all logs: patterns of joint or frame names, see `fits`."""
 
 _UNITS = dict(zip(CHANNELS, ("N m", "N", "N m", "N", "N m"), strict=True))
 _SIZES = dict(zip(CHANNELS, (5.0, 50.0, 5.0, 50.0, 5.0), strict=True))
@@ -111,8 +110,7 @@ ACTUATORS = {
 }
 """Terms of actuators, each with a field of its name in `ExtraTerms` and in the settings `actuators`.
 
-Which of them a replay simulates, and a file of the robot has a place for, is said there (`torchid.commands.replay`,
-`torchid.report.robot_files`).
+`torchid.commands.replay` and `torchid.report.robot_files` state which of them they support.
 """
 
 

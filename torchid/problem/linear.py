@@ -18,7 +18,7 @@ from torchid.reprs import short_repr
 from torchid.rounding import RANK_TOLERANCE
 
 AT_BOUND = 1e-5
-"""A number within this share of its scale of a bound is at it: solvers stop 1e-9 to 1e-7 away."""
+"""A number closer to a bound than this fraction of its scale counts as at the bound; solvers stop 1e-9 to 1e-7 away."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class EliminatedTerms:
 
 T = TypeVar("T")
 
-_MERGED = 8  # blocks that are factorized at once: half of the work of one after the other
+_MERGED = 8  # blocks per factorization: half of the work of one at a time
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from torchid.robot.tree import LOOPS_FIELD
 from torchid.sensing import SensorSet
 
 _LISTED = 6
-_NO_TORQUE = 1e-9  # N m or N: what a simulator's log may have of a joint without a motor
+_NO_TORQUE = 1e-9  # N m or N: rounding in a simulator's torque of a joint without a motor
 
 
 def joint_order(log: Log, robot: Robot) -> list[int]:
@@ -178,9 +178,9 @@ def require_closed_loops(source: str, joint_position: torch.Tensor, robot: Robot
             raise LogError(source, f"{LOOPS_FIELD}[{number}]", reason, accepted)
 
 
-_FAR = 0.1  # rad or m, that joints move between samples which are found from the assembled posture
+_FAR = 0.1  # rad or m of joint motion between samples that are solved from the assembled posture
 _PATH = 20  # steps on the way from there
-_DETERMINED = 1e-6  # least over largest singular value, of the loops' Jacobian by the joints in question
+_DETERMINED = 1e-6  # smallest over largest singular value of the loops' Jacobian for the missing joints
 
 
 def with_loop_joints(log: Log, robot: Robot | None) -> Log:

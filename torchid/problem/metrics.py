@@ -378,7 +378,7 @@ def projected_forces(builder: RowBuilder, samples: Samples, phi: torch.Tensor) -
 # -------------------------------------------------------------------------------------------------- sums of squares
 
 WHITENED = "projected_residual"
-"""The group of the rows of a fit: whitened, and projected so that nothing unmeasured is in them."""
+"""Group of the fit's rows: whitened and projected."""
 
 ROW_GROUPS = {
     "joint_torque": "joint torque [N m]",
@@ -386,32 +386,32 @@ ROW_GROUPS = {
     "base_moment": "base moment [N m]",
     "nullspace": "projected [N, N m]",
 }
-"""Groups of rows that errors are given for, with a name and unit to show."""
+"""Groups of rows with errors, with a name and unit to show."""
 
 ERROR_GROUPS = ROW_GROUPS | {WHITENED: "whitened [x noise]"}
-"""Those, and the whitened projected residual of a fit's rows, which every sensor set has."""
+"""The same, and the whitened projected residual of a fit's rows, which every sensor set has."""
 
-IN_AIR = "limbs in the air"  # whose joint torques alone count where no contact force was measured
+IN_AIR = "limbs in the air"  # only their joint torques count if no contact force was measured
 
 LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [N m]"}
 """Groups of readings of force/torque sensors in limbs."""
 
 PRESSURE = "centre_of_pressure"
 PRESSURE_GROUP = {PRESSURE: "centre of pressure [m]"}
-"""The point where the ground's forces meet the ground, where they carry a tenth of the weight or more."""
+"""The centre of pressure, where the ground carries at least a tenth of the weight."""
 
 _LABELS = ERROR_GROUPS | LIMB_GROUPS | PRESSURE_GROUP
-_BESIDE_ROWS = ("nullspace", WHITENED, PRESSURE)  # groups of one number each, which sums have behind the rows of K
+_BESIDE_ROWS = ("nullspace", WHITENED, PRESSURE)  # groups of one number each, after the rows of K in sums
 _VECTORS = ("base_force", "base_moment", *LIMB_GROUPS)  # groups with three axes
 
 LOG_SETS = ("train", "test")
-"""Sets of logs that errors are given for."""
+"""Sets of logs with errors."""
 
 BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis in "xyz")
 """Names of the six base rows."""
 
 DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", *LIMB_GROUPS, WHITENED)
-"""Groups of rows by which parameters are compared with the nominal ones."""
+"""Groups of rows that decide whether parameters are better than the nominal ones."""
 
 ADVICE = (
     "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge than in "
@@ -419,9 +419,9 @@ ADVICE = (
 )
 """Advice for parameters that predict worse than the nominal ones."""
 
-_CARRIES = 0.1  # of the weight in the robot's file: with less force on the ground its point says nothing
-_CLEARLY = 1.05  # ratio of errors above which one is worse
-_MATTERS = 1e-3  # of the measured rms: smaller differences, as on data without noise, do not count
+_CARRIES = 0.1  # fraction of the weight; with less force there is no meaningful centre of pressure
+_CLEARLY = 1.05  # ratio of errors that counts as worse
+_MATTERS = 1e-3  # fraction of the measured rms; smaller differences do not count
 
 
 class SumsOfSquares:

@@ -21,12 +21,12 @@ from torchid.robot import Robot
 from torchid.sensing import Contact
 
 MIN_MOTION = 0.01
-"""Travel [rad or m] up to which a joint stands still."""
+"""A joint with less travel [rad or m] counts as still."""
 MIN_TURN_DEG = 1.0
-"""Turn [degrees] from which on a base moves."""
+"""A base with less rotation [degrees] counts as still."""
 
 FROM_PREPROCESS = "the field; torchid.preprocess(log) computes it"
-"""What messages accept in place of a missing derivative."""
+"""Accepted for a missing derivative, in messages."""
 
 _POSE_FIELDS = (
     "base_quat_xyzw",

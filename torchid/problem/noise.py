@@ -38,11 +38,11 @@ from torchid.problem.samples import Samples
 from torchid.rounding import MAD_PER_STD, RANK_TOLERANCE, is_significant
 from torchid.sensing.sensors import measured_components
 
-_SAMPLES = 1000  # give a standard deviation to 2 to 3 %
+_SAMPLES = 1000  # enough for a standard deviation within 2 to 3 %
 _BYTES = 2**27  # of rows in memory
 _CHUNK = 256  # samples
 CLIP = 3.0
-"""Robust standard deviations at which residuals, of impacts for instance, are clipped."""
+"""Residuals (of impacts, for instance) are clipped at this many robust standard deviations."""
 
 
 def noise_of_sensors(builder: RowBuilder) -> dict[str, float]:
@@ -257,10 +257,10 @@ def _random_chunks(
             yield chosen[where], state
 
 
-_LEAST = 1e-4  # variance of the logarithms: deviations are 0.5 % apart
-_MOST = 1e3  # the same: deviations may be anything
+_LEAST = 1e-4  # variance of the logarithms: standard deviations within 0.5 %
+_MOST = 1e3  # the same: any standard deviation
 _POINTS = 41
-_HELD_OTHERS = 1e-6  # share of the information on other variances that is added to it: some may have none
+_HELD_OTHERS = 1e-6  # fraction added to the information on other variances, because it may be zero
 
 
 def information_about(index: np.ndarray, information: Array, score: Array) -> tuple[Array, Array]:
@@ -311,21 +311,21 @@ def prior_precision(logarithms: Array, information: Array, score: Array) -> Arra
     return (np.eye(count) - 1.0 / count) / float(np.exp(spread))
 
 
-_THINNED = 4  # leverage is computed from one in so many of these
+_THINNED = 4  # leverage is computed from every fourth sample
 _CLIPPED = 0.99501  # E[min(x^2, 9)] of standard normal x
-_HELD = 0.005  # weight of the previous variances against the residuals: determines confounded ones
+_HELD = 0.005  # weight of the previous variances, which decides confounded ones
 _LEAST_STEP = 0.05  # least factor of a variance in one step
-_SHARE = 0.01  # least share of a group in the variance along its own directions: a tenth of the deviation there
+_SHARE = 0.01  # least fraction of a group in the variance along its directions (a tenth of the deviation)
 #: Of the stated noise, least standard deviation: exact logs leave only rounding. Where none is stated it is of the
 #: forces themselves, if these are less than what is guessed, as those of robots of millimetres are.
 _SMALLEST = 1e-3
-_LEFT = 0.1  # least share of the residual's degrees of freedom that a group is assigned
+_LEFT = 0.1  # least fraction of the residual's degrees of freedom for a group
 _FEW = 20.0  # least number of independent readings: a standard deviation to 16 %
-_NEGLIGIBLE = 1e-9  # share of a source's variance in the rows below which it is projected out
+_NEGLIGIBLE = 1e-9  # a source with a smaller fraction of its variance in the rows is projected out
 _STEADY = 0.01  # relative change of the noise along the directions of any group
 _STEPS = 40  # at most
 _CONFOUNDED = 0.5  # relative standard error of a standard deviation
-_POOLED = 0.5  # share of the prior in what determines a variance
+_POOLED = 0.5  # fraction of the prior in the information on a variance
 
 
 @dataclass(frozen=True)

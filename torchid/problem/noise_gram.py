@@ -38,10 +38,10 @@ Beyond, the size of what is taken off, which chance changes by a third in logs o
 combination. Less is taken off, and the nominal parameters make up for what is then too much.
 """
 
-_MOST_SIGNAL = 2.0  # beyond, it is rounding, of combinations that the rows hardly determine
+_MOST_SIGNAL = 2.0  # beyond, it is rounding
 _LEAST_PERTURBED = 5000  # samples of all logs, evenly spread, see `_perturbed`
 _MOST_PERTURBED = 20_000  # likewise
-_NEGLIGIBLE = 1e-5  # share of noise in any combination: far below all standard errors
+_NEGLIGIBLE = 1e-5  # fraction of noise in any combination, far below all standard errors
 _COPIES = 3  # of each sample, see `_copies`
 _RESOLVED = 1e-5  # least singular value, of columns of unit size, along which a difference of squares is no rounding
 

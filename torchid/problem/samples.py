@@ -41,9 +41,9 @@ from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX, recorded_compone
 
 _AS_MEASURED = "a number in every sample, or sensors without this one"
 ACTIVE = "(N, C) bool, true while a contact touches the ground"
-"""What messages accept as `contact_active`."""
+"""Accepted for `contact_active`, in messages."""
 
-_FAR_APART = 8  # samples per chosen one, beyond which a page holds few of these
+_FAR_APART = 8  # samples per selected sample, above which a page has few selected ones
 _JOINT_FIELDS = ("joint_position", "joint_velocity", "joint_acceleration")
 
 
@@ -279,7 +279,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         raise LogError(log.source, "contact_wrench_world", "needs the base's orientation, which is missing", accepted)
     normals = _contact_normals(log, robot, contacts, base, chosen, active)
     wrench = _wrenches(log, contacts, chosen)
-    if wrench is not None and base.position is not None:  # whatever is not known of a force is not of a moment either
+    if wrench is not None and base.position is not None:  # where a force is unknown, the moment is too
         lost = np.isnan(wrench[..., :3]).any(axis=2, keepdims=True) & (np.arange(6) >= 3)
         wrench = np.where(lost, np.nan, wrench) if lost.any() else wrench
     unloaded = unloaded_readings(log) if contacts else None
@@ -452,7 +452,7 @@ def _scalar_error(samples: Samples, frame: str, sample: int, k: int) -> LogError
     return LogError(samples.source, field, reason, _AS_MEASURED)
 
 
-_MIN_ACCELERATION = 0.1 * GRAVITY  # [m/s^2] rms, of a base that is shaken; noise of a pose in half a millimetre: 0.4
+_MIN_ACCELERATION = 0.1 * GRAVITY  # [m/s^2] rms, of a moving base
 _MOST_SAMPLES = 5_000  # evenly spaced
 
 

@@ -22,11 +22,11 @@ from torchid.rounding import MAD_PER_STD
 from torchid.sensing import Contact
 
 LEAST_READINGS = 16
-"""In the air, for one equation."""
+"""Least number of readings in the air for an equation."""
 
 _BATCHES = 8  # batches of successive readings, whose means show drift
-_MASKED_SHARE = 0.01  # readings are masked or clamped, not measured, if more than this share is exactly 0 ...
-_ONE_SIDED = 0.05  # ... and less than this share has one of the signs (else 0 is one step of a coarse sensor)
+_MASKED_SHARE = 0.01  # readings are masked or clamped if more than this fraction is exactly 0 ...
+_ONE_SIDED = 0.05  # ... and less than this fraction has one of the signs (otherwise 0 is a step of a coarse sensor)
 _OUTLYING = 4.0  # standard deviations; of Gaussian readings 6e-5 are dropped
 
 
@@ -135,7 +135,7 @@ def zero_in_air(log: Log, contacts: Sequence[Contact]) -> Log:
     six = np.zeros((len(log), count, 6)) if wrench is None else wrench
     along = np.zeros((len(log), count)) if scalar is None else scalar
     readings = np.concatenate([six, along[..., None]], axis=2)
-    reads = np.nan_to_num(readings).any(axis=0)  # others are such as moments of points
+    reads = np.nan_to_num(readings).any(axis=0)  # others are, for example, moments of point contacts
     if log.contact_active is None:
         in_the_air = np.zeros(readings.shape[:2], dtype=bool)
     else:

@@ -21,7 +21,7 @@ _REVOLUTE_KEPT = (1, 2, 4, 5, 6, 8, 9)  # mcx, mcy, Ixx, Ixy, Ixz, Iyz, Izz
 _PRISMATIC_KEPT = (0, 1, 2, 3)  # m, mcx, mcy, mcz
 _IXX = 4
 _IYY = 7
-_TOGETHER = 2**15  # bodies times samples: what is worked out for them stays in a processor's second-level cache
+_TOGETHER = 2**15  # bodies times samples per step, so that results stay in the second-level cache
 
 
 @dataclass(frozen=True)

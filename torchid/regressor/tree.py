@@ -265,7 +265,7 @@ class KinematicTree(nn.Module):
         return path
 
 
-@lru_cache  # of a few axes, which take half of the time of a tree
+@lru_cache  # a few axes take half of the time of a tree
 def _rotation_to_z(x: float, y: float, z: float) -> Array:
     """A rotation whose third column is an axis."""
     return np.eye(3) if z == 1.0 else Rotation.align_vectors([[x, y, z]], [[0.0, 0.0, 1.0]])[0].as_matrix()

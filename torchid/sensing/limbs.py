@@ -15,7 +15,7 @@ BASE = 6
 """Rows of the base in a generalized force."""
 
 WELL_CONDITIONED = 1e4  # of a limb, in the Frobenius norm: a knee that is not straight
-PIVOT = 1e-6  # what is left of the square of a column: below it, the columns are nearly dependent
+PIVOT = 1e-6  # remaining fraction of a column's square; below, the columns are nearly dependent
 _OF_BASE = (slice(0, 3), slice(3, BASE))  # force and moment
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchid.reprs import short_repr
 from torchid.rounding import BASE_RANK_TOLERANCE, KINEMATIC_TOLERANCE, relative_tolerance
 
-_ROUNDINGS = 100.0  # of a unit term: by so many units of rounding an entry of a Jacobian may be off
+_ROUNDINGS = 100.0  # rounding error of a Jacobian entry, in units of rounding of a unit term
 _SUSPECT = 1e3  # below this many tolerances, the QR path hands the sample to an SVD
 
 

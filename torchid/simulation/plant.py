@@ -31,7 +31,7 @@ from torchid.robot.urdf import TreeJoint, drop_repeated_origins, parse_xml, read
 from torchid.robot.xml_files import file_kind, is_mjcf, plain_urdf
 from torchid.sensing.sensors import NORMAL_FORCE
 
-_RADIUS = 1e-4  # m, of contact points that the file gives: where they touch the floor is where they are
+_RADIUS = 1e-4  # m, of contact points of the file: they touch the floor at their own position
 _NARROWEST = 1e-3  # m, of a support polygon
 
 
@@ -131,9 +131,9 @@ def form_polygon(points: Array) -> bool:
 
 
 WORLD = "world link"
-"""Name of a link that is called as MuJoCo's own world."""
+"""Name for a link "world", which MuJoCo would drop."""
 
-_STIFFEST = 0.9999  # share of a violation's acceleration that MuJoCo's constraints take away at most
+_STIFFEST = 0.9999  # largest fraction of a violation's acceleration that MuJoCo's constraints remove
 
 
 @dataclass(frozen=True)
