@@ -150,7 +150,7 @@ SETTINGS: list[tuple[str, ...]] = [
      "sensors.scales.joint_torque: 'front_left_hip' in two groups, [*_hip] and [*_knee, front_*_hip]; accepted:"),
     (SCALES % "['*_hp']", "sensors.scales.joint_torque: unknown name '*_hp'; accepted: "),
     ("sensors={joint_torques: [front_left_hip, front_left_knee], scales: {joint_torque: ['*_thigh']}}",
-     "joint_torque: '*_thigh', whose joint_torque is not measured; accepted: front_left_hip, front_left_knee"),
+     "joint_torque: '*_thigh', its joint_torque is not measured; accepted: front_left_hip, front_left_knee"),
     (SCALES % "{hips: '*_hip'}",
      "sensors.scales.joint_torque: found {'hips': '*_hip'}; accepted: log, all, or a list of groups of joints"),
     (SCALES % "[[]]", "sensors.scales.joint_torque: found [[]]; accepted: log, all, or a list of groups"),

@@ -123,9 +123,9 @@ def test_a_fit_that_predicts_worse_than_the_urdf_says_so_first(
     assert main(["identify", str(DEMO / "quadruped.yaml"), *options]) == 0
     printed = capsys.readouterr()
     headline, *_ = printed.out.splitlines()
-    assert headline.startswith("WORSE THAN URDF: the identified parameters predict worse than the URDF's")
+    assert headline.startswith("WORSE THAN URDF: the identified parameters predict worse than the URDF, on ")
     assert "NumericalWarning" in printed.err
-    assert "predict worse than the URDF's, on blocks left out of the fit: joint torque" in printed.err
+    assert "predict worse than the URDF, on blocks left out of the fit: joint torque" in printed.err
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["verdict"] in printed.err
     worse = {(x["logs"], x["group"]): x for x in metrics["worse_than_nominal"]}

@@ -97,7 +97,7 @@ def test_pd_targets_keep_both_nearer_to_the_log(run: Path, tmp_path: Path, capsy
     [
         (["--window", "0"], "--window: 0"),
         (["--window", "nan"], "--window: nan"),
-        (["--window", "1e9"], "no 1e+09 s without a gap"),
+        (["--window", "1e9"], "no window of 1e+09 s without a gap"),
         (["--window", "1e-6"], "windows of 1e-06 s"),
     ],
 )

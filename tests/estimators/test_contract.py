@@ -180,7 +180,7 @@ class EstimatorContract(ABC):
         if not self.body_by_body:
             assert self.solve(problem).phi[3] == problem.nominal[3]
             return
-        with pytest.raises(ValueError, match="body by body"):
+        with pytest.raises(ValueError, match="both free and fixed inertial parameters"):
             self.solve(problem)
 
 

@@ -330,7 +330,7 @@ def test_what_needs_attention_is_named_with_what_to_do(free: Identification) -> 
     worse = replace(free)
     worse.__dict__["worse"] = [WorseThanNominal("test logs", "joint_torque", 1.0, 2.0)]
     said = text(worse, 400)
-    assert said.startswith("WORSE THAN URDF: the identified parameters predict worse than the URDF's, on test logs")
+    assert said.startswith("WORSE THAN URDF: the identified parameters predict worse than the URDF, on test logs")
     assert said.index("attention     do not use them") < said.index("attention     friction, ")
 
 

@@ -74,7 +74,7 @@ def test_the_worst_log_comes_first_and_what_is_worse_than_the_urdf_is_said(evalu
     logs = with_logs(evaluated, {"good": 0.1, "bad": 5.0, "fair": 0.2})
     said = " ".join(line.strip() for line in evaluation_lines(logs, 80))
     assert said.startswith(
-        "WORSE THAN URDF: the identified parameters predict worse than the URDF's, on bad: joint torque 5"
+        "WORSE THAN URDF: the identified parameters predict worse than the URDF, on bad: joint torque 5"
     )
     assert said.index("on bad") < said.index("on fair") < said.index("on good")
 

@@ -121,7 +121,7 @@ class ConicProblem:
         return np.concatenate([np.linalg.eigvalsh(self.blocks(x)).ravel(), self.G @ x - self.h])
 
     def active(self, x: Array, tolerance: float) -> tuple[str, ...]:
-        """Names of conditions from whose border x (n,) is no further than a tolerance; an entropic prior is none."""
+        """Names of conditions that hold with equality at x (n,), within a tolerance."""
         blocks, rows = np.split(self.slack(x), [4 * len(self.F0)])
         slack = np.append(np.where(self.weights > 0.0, np.inf, blocks.reshape(-1, 4).min(axis=1, initial=np.inf)), rows)
         near = slack <= tolerance
@@ -219,7 +219,7 @@ def _reduced(rows: list[LinearCondition], count: int) -> tuple[Array, Array]:
 
 
 def _without_implied(rows: list[LinearCondition], E: Array, e: Array) -> list[LinearCondition]:
-    """The inequalities without those that equalities E x = e imply: with them there is no strictly feasible point.
+    """Drop the inequalities that the equalities E x = e already imply; with them no point is strictly feasible.
 
     Raises:
         InputError: an inequality contradicts the equalities.
@@ -242,12 +242,14 @@ _FLOOR_OF_RIDGE = 1e-3
 
 
 class _Scaled:
-    """All parameters in units of their scale, and the terms of the problem in theirs: `start + slopes @ x`.
+    """Parameters and terms in scaled units: `start + slopes @ x`.
 
     Attributes:
-        start: (12 L + M,); slopes: (12 L + M, n), zero rows for what is fixed.
+        start: (12 L + M,).
+        slopes: (12 L + M, n), zero rows for fixed parameters.
         deviations: (n, n), the other rows.
-        place: (L, 12) int, which entries of x belong to free parameters; bodies: those whose inertia is free.
+        place: (L, 12) int, entry of x of each free parameter.
+        bodies: bodies with free inertia.
     """
 
     def __init__(self, problem: LinearProblem, conditions: Conditions, prior: Prior, metric: Array) -> None:
@@ -307,14 +309,14 @@ class _Block:
 def build_conic_problem(
     problem: LinearProblem, conditions: Conditions, ridge: float, prior: Prior, reference: Array | None = None
 ) -> ConicProblem:
-    """The convex problem in x, the deviation of the free parameters from nominal in units of their scale.
+    """Build the convex problem in x, the scaled deviation of the free parameters from the nominal ones.
 
     Args:
         problem: the data.
         conditions: on the parameters.
         ridge: weight of the prior.
-        prior: the distance from the nominal parameters, as in `Consistent`.
-        reference: (12 L,), parameters whose pseudo-inertias are the metric of a pull-back prior; None for nominal ones.
+        prior: distance from the nominal parameters, as in `Consistent`.
+        reference: (12 L,), pseudo-inertias of the metric of a pull-back prior; None for the nominal ones.
     """
     conditions.validate_bodies(len(problem.nominal) // PER_BODY)
     x = _Scaled(problem, conditions, prior, problem.nominal if reference is None else reference)
@@ -487,10 +489,10 @@ _SHORTEST = 1e-6  # least fraction of a step; below, rounding decides about feas
 @one_thread()
 @torch.inference_mode()
 def find_strictly_feasible(problem: ConicProblem) -> tuple[Array, int]:
-    """A strictly feasible x, (n,), near 0 where possible, and the Newton steps it took to find (phase I).
+    """Find a strictly feasible x, (n,), near 0 if possible (phase I); return it with the number of Newton steps.
 
     Raises:
-        InputError: there is none; names the condition that is violated most.
+        InputError: there is none; the message names the most violated condition.
     """
     x = problem.E.T @ problem.e
     worst = float(problem.slack(x).min(initial=np.inf))
@@ -660,7 +662,7 @@ class _Point:
 
 @dataclass(frozen=True)
 class _Direction:
-    """Changes of a point, in its own coordinates; those of the blocks are (K, 4, 4)."""
+    """Step of a point, in its own coordinates; steps of the blocks are (K, 4, 4)."""
 
     x: Tensor
     blocks: Tensor
@@ -715,7 +717,7 @@ class PrimalDual:
         return (point.whitening.mT @ point.Z @ point.whitening).numpy(), point.y.numpy()
 
     def step(self, point: _Point) -> _Point | None:
-        """The next point; None where rounding leaves none."""
+        """The next point; None if rounding prevents it."""
         Z_root, failed = torch.linalg.cholesky_ex(point.Z)
         if failed.any():
             return None
@@ -751,7 +753,7 @@ class PrimalDual:
         return point.x.numpy()
 
     def _moved(self, point: _Point, move: _Direction, length: float) -> _Point | None:
-        """A share of a step from a point; None where rounding leaves none."""
+        """A fraction of a step from a point; None if rounding prevents it."""
         while (factors := self.factors(point.x + length * move.x)) is None and length > _SHORTEST:
             length *= 0.5  # infeasible by rounding alone
         if factors is None:

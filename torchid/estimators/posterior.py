@@ -120,16 +120,16 @@ class Posterior:
 def whitened_rows(
     problem: LinearProblem, noise: float, block_deviations: Array | None, combinations: Array | None = None
 ) -> tuple[Array, Array]:
-    """Rows A, (R, 12 L), and b, (R,), with noise of unit variance, for the likelihood of a fit.
+    """Rows A, (R, 12 L), and b, (R,), with unit noise variance, for the likelihood of a fit.
 
     Args:
-        problem: that was fitted.
-        noise: standard deviation of its rows, correlation counted, as in the standard errors.
-        block_deviations: (G, 12 L), of the parameters by the scatter between blocks of the logs, without
-            regularization, whose outer products sum up to a covariance; None without blocks. It takes the noise's place
-            along the singular vectors of the rows along which it is the larger, as in the standard errors.
-        combinations: (K, 12 L), of the parameters whose standard errors are reported: along each of them rows are no
-            sharper than the scatter says. None for none.
+        problem: of the fit.
+        noise: standard deviation of its rows with correlation, as in the standard errors.
+        block_deviations: (G, 12 L), of the parameters between blocks of the logs, without regularization; the sum of
+            their outer products is a covariance. None without blocks. It replaces the noise along singular vectors of
+            the rows where it is larger.
+        combinations: (K, 12 L), parameter combinations with reported standard errors; along these the rows are not more
+            precise than the scatter. Or None.
     """
     noise = max(noise, _LEAST_NOISE * float(np.linalg.norm(problem.b)) / max(problem.rows, 1) ** 0.5, 1e-300)
     covariance = noise**2 * np.eye(len(problem.b))
@@ -172,13 +172,13 @@ _MUCH = 1.5  # times the prior's width; smaller factors hardly change the ranges
 
 @dataclass(frozen=True)
 class NominalError:
-    """By how much nominal bodies are off along what the data determine.
+    """Error of the nominal bodies along what the data determine.
 
     Attributes:
-        value: standard deviation as a share of each body, that makes the data likeliest; as `prior_error` has it.
-        prior: that it was compared with.
-        evidence: twice the logarithm of how much likelier the data are with `value`.
-        combinations: of inertial parameters that the data determine better than a prior of this width does.
+        value: most likely standard deviation, relative to each body, as `prior_error`.
+        prior: the width it is compared with.
+        evidence: twice the logarithm of the likelihood ratio for `value`.
+        combinations: number of inertial combinations that the data determine better than such a prior.
     """
 
     value: float
@@ -196,7 +196,7 @@ class NominalError:
 
     @property
     def prior_is_narrow(self) -> bool:
-        """Whether bodies are much further off than the prior says, beyond chance."""
+        """Whether the bodies' error is significantly and much larger than the prior."""
         return self.clear and self.value > _MUCH * self.prior
 
     def __str__(self) -> str:
@@ -208,12 +208,12 @@ class NominalError:
 
 @one_thread()
 def nominal_error(posterior: Posterior) -> NominalError | None:
-    """The width of the prior by the data (empirical Bayes); None where these determine no inertial parameters.
+    """Width of the prior from the data (empirical Bayes); None if the data determine no inertial parameters.
 
-    Bodies that data do not determine are taken to be as wrong as those that they do. Friction and extra parameters may
-    have any value, as files seldom state them; conditions on the parameters are left out.
+    Undetermined bodies are assumed to be as wrong as determined ones. Friction and extra parameters are unconstrained,
+    because files seldom state them; conditions are ignored.
 
-    Source: as `_likelihood_of_widths` has it.
+    Source: as in `_likelihood_of_widths`.
     """
     inertial = np.zeros(len(posterior.nominal), dtype=bool).reshape(-1, PER_BODY)
     inertial[:, INERTIAL] = True

@@ -187,14 +187,13 @@ class _State:
 class EllipticalSlice(torch.nn.Module):
     """Draws from exp(-objective / 2) of a conic problem, within its conditions.
 
-    An ellipse through the state and a draw from the Gaussian has that Gaussian's density all along, so that a point of
-    it needs only to meet the conditions, and to be likely enough by what the density has beside the Gaussian
-    (`BarrierGaussian`): the arc is cut down until one does. Where conditions are far, all variables together move so.
-    Else two bodies move at a time, which few of these concern. Which moves it takes, and how many passes of them make a
-    state new, is measured once, on a first set of chains.
+    The Gaussian's density is constant along an ellipse through the state and a draw from the Gaussian. So a point on
+    the ellipse needs only to meet the conditions and the remaining density factor (`BarrierGaussian`); the arc is
+    shortened until one does. If the conditions are far, all variables move together, otherwise two bodies at a time.
+    The kind of move, and the number of passes for an independent state, are measured once, on a first set of chains.
 
-    Source: Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010; with a Gaussian of one's own choice:
-    Nishihara, Murray, Adams, "Parallel MCMC with generalized elliptical slice sampling", JMLR 2014.
+    Source: Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010; with a chosen Gaussian: Nishihara, Murray,
+    Adams, "Parallel MCMC with generalized elliptical slice sampling", JMLR 2014.
     """
 
     mean: Tensor
@@ -208,16 +207,16 @@ class EllipticalSlice(torch.nn.Module):
     unit: Tensor
 
     def __init__(self, gaussian: BarrierGaussian, variables: np.ndarray, E: Array, owners: np.ndarray) -> None:
-        """Prepare.
+        """Measure the moves.
 
         Args:
-            gaussian: that stands for the problem.
-            variables: (K, 10) int, on which the blocks depend.
+            gaussian: approximation of the problem.
+            variables: (K, 10) int, of the blocks.
             E: (Q, n), of the equalities.
-            owners: (n,) int, to which body each variable belongs.
+            owners: (n,) int, body of each variable.
 
         Warns:
-            NumericalWarning: states stay alike for too long, so that draws will be correlated.
+            NumericalWarning: states stay correlated for too long, so draws will be correlated.
         """
         super().__init__()
         arrays = {
@@ -256,7 +255,7 @@ class EllipticalSlice(torch.nn.Module):
         self._groups += 1
 
     def states(self, chains: int, generator: torch.Generator) -> Iterator[Tensor]:
-        """Points x of so many chains, (n, chains), on the device of the module, again and again, new ones each time."""
+        """Yield independent points x of all chains, (n, chains), on the device of the module."""
         state = self._start(chains, generator)
         for _ in range(_BURN_IN * self.passes):
             self._pass(state, generator)
@@ -410,14 +409,14 @@ def inside(blocks: Tensor, rows: Tensor) -> Tensor:
 
 
 def _standardized(x: Tensor) -> Tensor:
-    """Coordinates (n, B) with mean 0 and variance 1 over the chains; those that do not move are 0."""
+    """Coordinates (n, B) with mean 0 and variance 1 over the chains; constant ones are 0."""
     centred = x - x.mean(dim=1, keepdim=True)
     deviation = centred.square().mean(dim=1, keepdim=True).sqrt()
     return torch.where(deviation > 0.0, centred / deviation, 0.0)
 
 
 def _pairs(gaussian: BarrierGaussian, owners: np.ndarray) -> list[np.ndarray]:
-    """Variables of pairs of bodies that are most correlated: those of the tree that spans all bodies best."""
+    """Variables of the most correlated pairs of bodies: the edges of the best spanning tree."""
     bodies = np.unique(owners)
     deviation = np.linalg.norm(gaussian.directions, axis=1)
     scaled = gaussian.directions / np.where(deviation > 0.0, deviation, 1.0)[:, None]
@@ -441,14 +440,14 @@ _BATCHES = 2
 class TruncatedGaussian(torch.nn.Module):
     """Draws from exp(-objective / 2) of a conic problem, within its conditions.
 
-    Few conditions are near: most often bounds of friction and armatures, and a body or two. The variables that these
-    concern, and those of equalities, are sampled by chains (`EllipticalSlice`) in their marginal density, cut off by
-    the conditions on them; all others have a Gaussian given these, which is drawn exactly. A draw that breaks one of
-    the conditions that are far, which is rare, is dropped, chain's state and all.
+    Usually few conditions are near: bounds of friction and armatures, and one or two bodies. Chains (`EllipticalSlice`)
+    sample the variables of these conditions, and of equalities, from their truncated marginal density. All other
+    variables are Gaussian given these and are drawn exactly. A draw that violates a far condition (rare) is dropped.
 
     Attributes:
-        chains: of the variables that conditions nearby concern; None where there are none.
-        near: number of conditions nearby; `conditions`: of all.
+        chains: of the variables of near conditions; None without any.
+        near: number of near conditions.
+        conditions: number of all conditions.
     """
 
     mean: Tensor
@@ -462,17 +461,17 @@ class TruncatedGaussian(torch.nn.Module):
     unit: Tensor
 
     def __init__(self, conic: ConicProblem, owners: np.ndarray) -> None:
-        """Prepare.
+        """Find the near conditions and set up the chains.
 
         Args:
             conic: the problem, without log-determinants in its objective.
-            owners: (n,) int, to which body each variable belongs.
+            owners: (n,) int, body of each variable.
 
         Raises:
-            InputError: the conditions exclude each other.
+            InputError: the conditions contradict each other.
 
         Warns:
-            NumericalWarning: states of chains stay alike for too long, so that draws will be correlated.
+            NumericalWarning: states stay correlated for too long, so draws will be correlated.
         """
         super().__init__()
         gaussian = barrier_gaussian(conic)
@@ -510,11 +509,11 @@ class TruncatedGaussian(torch.nn.Module):
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)))
 
     def draw(self, count: int, generator: torch.Generator | None = None) -> Tensor:
-        """Points x, (count, n), on the device of the module; they do not depend on the number of threads.
+        """Draw points x, (count, n), on the device of the module; independent of the number of threads.
 
         Args:
-            count: number of them.
-            generator: of random numbers, on that device; None for torch's own.
+            count: number of points.
+            generator: of random numbers, on that device; None for torch's default.
         """
         device = self.mean.device
         batches = max(1, min(_BATCHES, count // _BATCH_CHAINS))
@@ -546,7 +545,7 @@ class TruncatedGaussian(torch.nn.Module):
             yield self.mean.new_empty(0, chains)
 
     def _completed(self, near: Tensor, generator: torch.Generator) -> Tensor:
-        """Points (n, B or fewer) of which a part is given, (c, B): those that meet all conditions."""
+        """Complete points from a part, (c, B): those, (n, B or fewer), that meet all conditions."""
         x = self.mean.new_empty(len(self.mean), near.shape[1])
         size = (len(self.far_mean), near.shape[1])
         drawn = torch.randn(size, dtype=x.dtype, device=x.device, generator=generator)

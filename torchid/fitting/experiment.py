@@ -145,7 +145,7 @@ def check_terms(
     for key, scopes in {"offsets": terms.offsets, "scales": terms.scales}.items():
         for channel, scope in scopes.items():
             if channel not in measured and (len(scopes) < len(CHANNELS) or not isinstance(scope, str)):
-                accepted = f"{', '.join(measured)}; or {key}: log, {key}: all for all measured kinds"
+                accepted = f"{', '.join(measured)}, or {key}: log or all, for all measured kinds"
                 raise ConfigError.at_field(f"sensors.{key}.{channel}", "no such sensor is measured", accepted)
     for kind, groups in _groups(terms).items():
         for pattern in (pattern for group in groups for pattern in group):

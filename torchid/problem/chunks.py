@@ -47,17 +47,17 @@ def map_chunks(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> list[Result]:
-    """Results of `reduce` over the chunks of some logs, one per worker.
+    """Apply `reduce` to the chunks of logs; one result per worker.
 
-    Processes that share their work (`torchid.distributed`) each take successive chunks; all get the results of all.
+    Processes that share their work (`torchid.distributed`) take successive chunks; all get the results of all.
 
     Args:
         logs: each is moved to the builder's device chunk by chunk, see `upload`.
-        builder: whose layouts and device are used.
-        reduce: given an iterator over some of the chunks and their contact states; what it returns pickles.
+        builder: with layouts and device.
+        reduce: takes an iterator over chunks and their contact states; its result must pickle.
         chunk: samples per chunk; by default `chunk_size` of the builder's device.
         threads: workers, each with one intra-op thread (small arrays do not profit from more); by default one per
-            intra-op thread torch would use, one if the builder is on a GPU.
+            intra-op thread of torch, or one on a GPU.
         progress: called with the number of samples done since the last call.
     """
     workers = threads or worker_count(builder.device)
@@ -85,13 +85,13 @@ def map_chunks(
 
 
 def choose_kernels(builder: RowBuilder, samples: int) -> None:
-    """Let a builder use compiled kernels for so many samples, if these pay and can be had, else torch's operators.
+    """Let a builder use compiled kernels for this many samples, if they are faster and available; otherwise torch.
 
-    Extra parameters of contact sensors, and task weights, are left to torch. Kernels need Numba (extra `[fast]`) that
-    suits the installed NumPy, and a place on disk where it may keep them.
+    Torch handles extra parameters of contact sensors, and task weights. Kernels need Numba (extra `[fast]`) that suits
+    the installed NumPy, and a folder for its cache.
 
     Warns:
-        TorchidWarning: Numba is there, but not these.
+        TorchidWarning: Numba is installed but the kernels do not load.
     """
     plain = builder.device.type == "cpu" and builder.tree.ancestors.dtype == torch.float64
     plain = plain and builder.task_weights is None and not any(extra.contacts for extra in builder.extras)
@@ -125,7 +125,7 @@ def _pieces(
 
 
 class _ProgressOfAll:
-    """Reports samples as if all processes were as far as this one, to a callback that need not be thread-safe."""
+    """Reports samples as if all processes were as far as this one; the callback need not be thread-safe."""
 
     def __init__(self, progress: ProgressCallback, total: int, share: int) -> None:
         self._progress = progress
@@ -147,7 +147,7 @@ class _ProgressOfAll:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Samples of one contact state, of one log: pieces of it, and which of their samples."""
+    """Samples of one contact state and log: its pieces, and the numbers of their samples."""
 
     state: ContactState
     parts: list[tuple[Samples, slice | torch.Tensor]]
@@ -161,7 +161,7 @@ def _size(samples: Samples, index: slice | torch.Tensor) -> int:
 
 
 def _chunks(logs: Sequence[Samples], size: int, workers: int) -> list[_Chunk]:
-    """Chunks of at most so many samples, small ones of one log joined: a chunk takes milliseconds, however small."""
+    """Chunks of limited size; small ones of one log are joined, because any chunk takes milliseconds."""
     out: list[_Chunk] = []
     last: dict[tuple[str, ContactState], _Chunk] = {}
     for samples in logs:
@@ -177,9 +177,9 @@ def _chunks(logs: Sequence[Samples], size: int, workers: int) -> list[_Chunk]:
 
 
 def are_of_one_log(piece: Samples, other: Samples) -> bool:
-    """Whether two pieces differ in samples, folds and blocks alone, and have no readings in the air.
+    """Whether two pieces differ only in samples, folds and blocks, and have no readings in the air.
 
-    Each fold, and each chunk, has equations of its own of these readings.
+    Readings in the air have separate equations for each fold and chunk.
     """
     if piece.unloaded is not None or other.unloaded is not None:
         return False
@@ -228,8 +228,8 @@ def chunks_by_state(
 
     Args:
         samples: of one log.
-        chunk: samples per chunk at most.
-        workers: that take turns with the chunks of a state, of which each gets as many, unless there is but one.
+        chunk: largest number of samples per chunk.
+        workers: each gets the same number of chunks of a state, unless there is only one.
     """
     active = samples.active.cpu().numpy()
     starts, state_of_run = _runs(active)
@@ -289,14 +289,13 @@ def worker_count(device: torch.device) -> int:
 
 
 def upload(chunks: Iterable[tuple[Samples, Label]], device: torch.device) -> Iterator[tuple[Samples, Label]]:
-    """The chunks, in order, on a device; on a CPU the chunks themselves.
+    """Copy chunks, in order, to a device; on a CPU the chunks themselves.
 
-    For a GPU a thread of its own makes them and copies them through page-locked memory on a stream of their own, at
-    most one ahead of the chunk that is worked on: the work waits neither for the host nor for copies, and the memory is
-    that of three chunks, page-locked, copied and worked on.
+    For a GPU, a separate thread makes them and copies them through page-locked memory on its own stream, at most one
+    ahead. The work waits neither for the host nor for copies, and three chunks are in memory at most.
 
     Args:
-        chunks: with whatever goes with each.
+        chunks: with further items each.
         device: of the work.
     """
     if device.type != "cuda":
@@ -318,7 +317,7 @@ def upload(chunks: Iterable[tuple[Samples, Label]], device: torch.device) -> Ite
 
 
 def one_ahead(items: Iterable[Item]) -> Iterator[Item]:
-    """The items; a thread of its own makes the next one while one is worked on."""
+    """The items; a separate thread makes the next one in advance."""
     following = iter(items)
     with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(thread_count(),)) as beside:
         made = beside.submit(list, islice(following, 1))

@@ -65,21 +65,20 @@ _FEWEST_TORQUES = 3  # above a contact, one for each component of a force
 
 @dataclass(config=STRICT, frozen=True)
 class DetectionConfig:
-    """How contacts are detected.
+    """Settings of contact detection.
 
-    A contact stands from where its normal force exceeds `touch` until it is below `lift`, shares of the robot's
-    weight by the URDF. Where the base's motion was measured, it stands also while it carries more than `light` and
-    keeps still, for twice `shortest_s` at least. Torques are low-pass filtered before (`cutoff_hz`, zero phase);
-    stances and swings shorter than `shortest_s` [s] are none. Samples within `margin_s` [s] of a change are dropped, as
-    are those within `preprocessing.contact_margin_s`. Contacts of which it is not certain that they are in the air
-    count as standing in all others: a force that may be zero costs a few equations, one that is ignored biases a fit.
+    A contact stands when its normal force exceeds `touch`, until it falls below `lift` (fractions of the URDF's
+    weight). With a measured base motion, it also stands while it carries more than `light` and does not move, for at
+    least twice `shortest_s`. Torques are low-pass filtered (`cutoff_hz`, zero phase). Stances and swings shorter than
+    `shortest_s` [s] do not count. Samples within `margin_s` [s] of a change are dropped, and those within
+    `preprocessing.contact_margin_s`. In all other samples, a contact that is not certainly in the air counts as
+    standing: a zero force costs a few equations, an ignored force biases a fit.
 
-    With `refit`, where the base's acceleration is known, parameters are then fitted to each log with the contacts that
-    were found, and contacts detected again with these: by thresholds that are lower in the same ratio, three standard
-    deviations of what feet seem to carry in the air, and with a wider filter, at last none, as long as these leave
-    `touch` as it is; then samples about touches by `touch` that are too short for a stance are dropped as well.
-    Of what that filter leaves, parameters are fitted again as long as feet seem to carry less in the air for it.
-    A contact that stands by either counts as standing, and samples about changes by the stated ones are dropped.
+    With `refit` and a known base acceleration, parameters are fitted to each log with these contacts, and detection is
+    repeated. The thresholds go down in the same ratio, to three standard deviations of the apparent load of feet in the
+    air. The filter gets wider, up to none, as long as its noise permits `touch`. Touches that are too short for a
+    stance are dropped with their neighbouring samples. The fit is repeated as long as it reduces the apparent load in
+    the air. A contact that stands in either detection counts as standing.
     """
 
     touch: Positive = 0.02
@@ -99,18 +98,18 @@ def with_detected_contacts(
     possible: bool = False,
     sign_width: float | None = None,
 ) -> tuple[Log, BoolArray]:
-    """The log with flags of all contacts by `detect_contacts` in the place of what it has, and where they are certain.
+    """Replace the flags of all contacts by those of `detect_contacts`, and mark the samples where they are certain.
 
     Args:
         log: as recorded.
         robot: the robot.
         contacts: that may stand.
         settings: thresholds.
-        possible: as of `Detection.flags`.
-        sign_width: as of `detect_contacts`.
+        possible: as in `Detection.flags`.
+        sign_width: as in `detect_contacts`.
 
     Raises:
-        LogError: as `detect_contacts`; wrenches without the name of a contact.
+        LogError: as `detect_contacts`; or wrenches without the name of a contact.
     """
     active, certain = detect_contacts(log, robot, contacts, settings or DetectionConfig(), sign_width).flags(possible)
     names = frames = tuple(contact.frame for contact in contacts)
@@ -125,14 +124,15 @@ def with_detected_contacts(
 
 
 class Detection(NamedTuple):
-    """Which contacts stand.
+    """Detected contacts.
 
     Attributes:
-        active: (N, C).
-        certain: samples (N,) whose `active` a fit may trust: neither those at both ends of a log, which the filter
-            spoils, nor those beside changes, nor stances that were too short to count.
-        possible: (N, C), `active` and contacts that may carry something all the same.
-        clear: samples (N,) without ends and changes, by the stated thresholds, in which no other contact carries any.
+        active: (N, C), standing contacts.
+        certain: samples (N,) with a reliable `active`: not at the ends of a log (filter), not near changes, not in
+            stances that were too short to count.
+        possible: (N, C), `active`, and contacts that may still carry a load.
+        clear: samples (N,) without ends and changes (by the stated thresholds) in which no other contact carries a
+            load.
     """
 
     active: BoolArray
@@ -141,10 +141,10 @@ class Detection(NamedTuple):
     clear: BoolArray
 
     def flags(self, possible: bool) -> tuple[BoolArray, BoolArray]:
-        """Flags (N, C), and samples (N,) that a fit may trust them in: of contacts that stand, or of possible ones.
+        """Flags (N, C) of standing or of possible contacts, and samples (N,) in which a fit may use them.
 
-        A contact that may stand is none to work a pose out of. Of unknown forces it may have one: nothing but the
-        equations that it takes is lost where that is zero.
+        A possible contact must not determine the base pose. But it may count as an unknown force: if the force is zero,
+        only a few equations are lost.
         """
         return (self.possible, self.clear) if possible else (self.active, self.certain)
 
@@ -152,18 +152,18 @@ class Detection(NamedTuple):
 def detect_contacts(
     log: Log, robot: Robot, contacts: Sequence[Contact], settings: DetectionConfig, sign_width: float | None = None
 ) -> Detection:
-    """Which contacts stand when.
+    """Detect standing contacts.
 
     Args:
         log: as recorded, with the torques of all joints above the contacts.
-        robot: the robot, whose base floats.
+        robot: with a floating base.
         contacts: that may stand.
         settings: thresholds.
-        sign_width: over which the sign of friction changes, as of `KinematicTree` [rad/s or m/s]; narrow by default.
+        sign_width: over which the sign of friction changes, as in `KinematicTree` [rad/s or m/s]; narrow by default.
 
     Raises:
-        LogError: no torques, fewer than three of joints above a contact, or joints that are missing.
-        InputError: a cutoff that does not suit the log.
+        LogError: the log has no torques, fewer than three measured joints above a contact, or lacks joints.
+        InputError: the cutoff does not suit the log.
     """
     if not contacts:
         none = np.zeros((len(log), 0), dtype=bool)
@@ -191,13 +191,13 @@ def _nearest(time: FloatArray, stamps: FloatArray) -> NDArray[np.intp]:
 
 @dataclasses.dataclass(frozen=True)
 class _Seen:
-    """What filtered signals say of contacts.
+    """Contact information from filtered signals.
 
     Attributes:
         known: the signals.
-        share: of the weight that contacts carry, (K, C).
-        velocity: (K, C, 3) [m/s], in the world or not; None where it is unknown.
-        in_world: whether it is.
+        share: fraction of the weight on each contact, (K, C).
+        velocity: (K, C, 3) [m/s], in the world or relative; None where unknown.
+        in_world: whether it is in the world.
         settings: thresholds.
     """
 
@@ -274,16 +274,16 @@ class _Seen:
 def _detect_again(
     filtered: Callable[[float], DetectionSamples], forces: ForcesAlongNormals, seen: _Seen, detection: Detection
 ) -> tuple[Detection, FloatArray]:
-    """Contacts by parameters that fit the log, and the stamps (K,) [s] of the samples in which they are known.
+    """Contacts from parameters that fit the log, and the stamps (K,) [s] of samples in which they are known.
 
-    Where a wider filter serves, parameters are fitted again to what it leaves, with all contacts that it shows, for as
-    long as feet seem to carry less in the air for it.
+    If a wider filter is possible, the parameters are fitted again to its signals, as long as this reduces the apparent
+    load of feet in the air.
 
     Args:
         filtered: the log at a cutoff.
         forces: by the URDF.
         seen: with these, at the cutoff of the settings.
-        detection: which contacts stand by these.
+        detection: contacts by these.
     """
     time = seen.time
     sharp = seen.known
@@ -318,16 +318,16 @@ def _sharpest(
     seen: _Seen,
     in_the_air: BoolArray,
 ) -> _Seen:
-    """What the widest filter shows whose noise leaves the thresholds as they are, or signals without one.
+    """Signals of the widest filter (or none) whose noise permits the thresholds.
 
-    A filter of 20 Hz shows an impact 25 ms early, and a foot that scuffs the floor for 5 ms not at all.
+    A 20 Hz filter shows an impact 25 ms early, and does not show a foot that scuffs the floor for 5 ms.
 
     Args:
         filtered: the log at a cutoff.
-        known: at the least of them.
+        known: at the lowest cutoff.
         forces: with parameters that fit the log.
         seen: settings, and stamps of those in the air.
-        in_the_air: contacts (K, C) that surely are.
+        in_the_air: contacts (K, C) that are certainly in the air.
     """
     best = _Seen.of(known, forces, seen.settings)
     highest = nyquist_hz(known.log.time)
@@ -340,14 +340,14 @@ def _sharpest(
 
 
 def _fitted(forces: ForcesAlongNormals, active: BoolArray, sure: BoolArray) -> ForcesAlongNormals | None:
-    """The forces of the robot with parameters that fit its torques; None without enough samples.
+    """Forces of the robot with parameters that fit its torques; None without enough samples.
 
-    Of samples in which contacts carry the robot: a belly or a rope leaves a part of its weight.
+    Only samples in which contacts carry the robot count; a belly or a rope could carry a part of its weight.
 
     Args:
         forces: by the URDF.
-        active: which contacts (K, C) stand or may do so.
-        sure: samples (K,) in which no other does.
+        active: contacts (K, C) that stand or may stand.
+        sure: samples (K,) in which no other contact does.
     """
     kept = np.flatnonzero(sure[forces.chosen] & (forces.unexplained < _SUPPORTED * forces.weight))
     if len(kept) < _LEAST_FITTED:
@@ -362,13 +362,13 @@ def _fitted(forces: ForcesAlongNormals, active: BoolArray, sure: BoolArray) -> F
 
 @dataclasses.dataclass(frozen=True)
 class DetectionSamples:
-    """A log that is filtered for detection.
+    """A log filtered for detection.
 
     Attributes:
         log: preprocessed, without contacts.
         samples: bound from it, one for one, in which all contacts stand.
         rotation: (K, 3, 3) of the base to a world with any heading.
-        cutoff_hz: of the filter, or half the sample rate or more where there is none.
+        cutoff_hz: of the filter; half the sample rate or more means no filter.
     """
 
     log: Log

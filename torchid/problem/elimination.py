@@ -30,13 +30,13 @@ _DIRECTIONS = {"forwards": 1.0, "backwards": -1.0}
 
 @dataclass(frozen=True)
 class Elimination:
-    """Unknowns psi of one log, or of all, in terms of the remaining ones x: `psi = inverse @ (z - C @ x)`.
+    """Eliminated unknowns psi of one log, or of all logs, from the remaining ones x: `psi = inverse @ (z - C @ x)`.
 
     Attributes:
-        log: their source, "" for those of all logs.
+        log: source of the log, "" for all logs.
         extras: M unknowns.
-        inverse: (M, r), of least norm; the noise of the r rows is white, of unit variance, and in no other row.
-        C: (r, 12 L + S), columns of the bodies' parameters and, for those of one log, of the S unknowns of all logs.
+        inverse: (M, r), of least norm. The r rows have white noise of unit variance that is in no other row.
+        C: (r, 12 L + S), columns of the bodies' parameters; for one log also of the S unknowns of all logs.
         D: (r, M), columns of the unknowns.
         z: (r,).
         std_if_known: (M,), standard deviation of each unknown if all else were known; infinite if no row depends on it.
@@ -54,7 +54,7 @@ class Elimination:
 
     @property
     def determined(self) -> np.ndarray:
-        """Unknowns that the rows give if the bodies' parameters are known, (M,) bool."""
+        """Unknowns that the rows determine if the bodies' parameters are known, (M,) bool."""
         return np.asarray(
             np.isfinite(self.std_if_known) & (np.linalg.norm(self.unobservable, axis=1) < UNOBSERVABLE_SHARE)
         )
@@ -64,12 +64,15 @@ class Elimination:
 class Assembly:
     """The problem in the bodies' parameters, and the eliminations: log by log, then of the unknowns of all logs.
 
-    `if_known`: the same problem if all eliminated unknowns were known to be 0. `noise`: what noise of the motion had
-    added to it. `forces`: squared norm of all measured forces, weighted. `stated`: how many of the last rows of
-    both problems are no data but what is known of the parameters; `data`: the problem without them. `homogeneous`:
-    whether unknown scales make up all of the measured forces, so that nothing says how large these are; `scaled_by` is
-    then the total mass [kg] that stands in for a known one, None if one is known. `reading_noise`: variance of the
-    noise of readings with unknown scales, by their columns, over the one that rows were weighted with.
+    Attributes:
+        if_known: the problem with all eliminated unknowns fixed at 0.
+        noise: subtracted motion noise.
+        forces: squared norm of all measured forces, weighted.
+        stated: number of last rows that are stated values, such as known masses; `data`: the problem without them.
+        homogeneous: whether unknown scales multiply all measured forces, so that their size is unknown.
+        scaled_by: total mass [kg] used in place of a known one in this case; None if a mass is known.
+        reading_noise: variance of the noise of readings with unknown scales, by column, relative to the variance that
+            weighted the rows.
     """
 
     problem: LinearProblem
@@ -84,9 +87,9 @@ class Assembly:
     reading_noise: Mapping[int, float] = field(default_factory=dict)
 
     def extras_at(self, phi: Array, psi: Array | None = None) -> list[Array]:
-        """Values of the eliminated unknowns, for each elimination, that fit the rows best at parameters (12 L,).
+        """Best values of the eliminated unknowns, for each elimination, at parameters (12 L,).
 
-        `psi`: (M,), those of all logs, where an estimate bounds them.
+        `psi`: (M,), those of all logs, if an estimate has bounds on them.
         """
         shared = [x.inverse @ (x.z - x.C @ phi) if psi is None else psi for x in self.eliminations if not x.log]
         remaining = np.concatenate([phi, *shared])
@@ -175,10 +178,10 @@ def assemble(
 def _eliminate_per_log(
     parts: Sequence[Part], builder: RowBuilder, prior: ColumnPrior, numbers: Sequence[int]
 ) -> tuple[list[Elimination], Array, Array | None]:
-    """Eliminate extra parameters that each log has of its own, of these numbers: log by log, as no other has them.
+    """Eliminate the extra parameters that each log has of its own, log by log.
 
     Returns:
-        What was eliminated; the triangle of what is left of all logs, (R, columns without them + 1); its shrinkage.
+        The eliminations; the remaining triangle of all logs, (R, remaining columns + 1); its shrinkage.
     """
     extras = tuple(builder.extras[number] for number in numbers)
     at = [builder.columns.count + n for n in numbers]
@@ -212,12 +215,12 @@ def problem_from_triangle(
 
     Args:
         R: (M, columns + 1).
-        rows: that went into it.
-        oversampling: of them.
+        rows: number of rows in it.
+        oversampling: of the rows.
         builder: of the rows.
         robot: the robot.
         friction: whether friction is free.
-        shrinkage: (columns, Q), as `CorrectedTriangle` has it.
+        shrinkage: (columns, Q), as in `CorrectedTriangle`.
     """
     count = builder.columns.count
     return LinearProblem(
@@ -267,7 +270,7 @@ def _bounded_terms(of_all: Elimination, robot: Robot) -> EliminatedTerms | None:
 
 
 def _dry_friction(robot: Robot, dof: int) -> Array:
-    """Coulomb friction at an independent joint, those that mimic it included, as a row on all parameters, (12 L,)."""
+    """Coulomb friction at an independent joint, with its mimic joints, as a row on all parameters, (12 L,)."""
     row = np.zeros((len(robot.bodies), PER_BODY))
     row[1:, parameters.COULOMB] = np.abs(robot.joint_map[0][:, dof])
     return row.flatten()

@@ -49,18 +49,18 @@ def spread_columns(parts: Sequence[tuple[Tensor, Tensor]], like: Tensor) -> Tens
 def whitened_bases(
     layout: ContactStateLayout, rows: ContactRows, axes: Tensor | None, order: Tensor, resting: Tensor | None = None
 ) -> Iterator[tuple[Tensor | slice, Tensor]]:
-    """Bases W of the null spaces of the unmeasured rows under which the projected noise is white, grouped by rank.
+    """Bases W of the null spaces of the unmeasured rows that whiten the projected noise, grouped by rank.
 
     Args:
         layout: of the samples' contact state.
         rows: of the samples.
-        axes: (B, 3, 3) or None, as of `whitened_null_space`.
-        order: (m,), as of `whitened_null_space`.
-        resting: (joints, B), coupled joints whose torque is unmeasured at a sample; None for none.
+        axes: (B, 3, 3) or None, as in `whitened_null_space`.
+        order: (m,), as in `whitened_null_space`.
+        resting: (joints, B), coupled joints whose torque is unmeasured in a sample; or None.
 
     Yields:
-        (index of the samples, W): W is (m, r, B'), triangular where the layout says so, with a column of zeros for each
-        row that a sample loses by `resting`.
+        (index of the samples, W): W is (m, r, B'), triangular if the layout says so, with a column of zeros for each
+            row that a sample loses by `resting`.
     """
     if resting is None:
         yield from _bases_of_measured_joints(layout, rows, axes, order)
@@ -126,16 +126,16 @@ def general_bases(
 
 
 def leave_out_torques(W: Tensor, resting: Tensor, row_std: Tensor | None = None) -> None:
-    """Make rows of bases zero in place, of joints whose torque is one more unmeasured force.
+    """Remove joints from bases, in place: their torque becomes a further unmeasured force.
 
-    What is left of the span of W is orthogonal to `W^T e_j` of each such joint j. A reflection from the right, which
-    keeps the noise white, turns that direction into the first column that is not zero yet, which then becomes zero:
-    shapes are the same for all samples, whatever rests. Where `W^T e_j` is rounding, no row had a torque of j.
+    The remaining span of W is orthogonal to `W^T e_j` of each such joint j. A reflection from the right, which keeps
+    the noise white, turns this direction into the first non-zero column, which is set to zero. So all shapes stay the
+    same. If `W^T e_j` is rounding, no row contained the torque of j.
 
     Args:
         W: (base rows + joints, r, B).
         resting: (joints, B) bool.
-        row_std: (base rows + joints,), noise that W is divided by; None for 1.
+        row_std: (base rows + joints,), noise that divides W; None for 1.
     """
     base = len(W) - len(resting)
     columns = torch.arange(W.shape[1], device=W.device)[:, None]
@@ -157,9 +157,9 @@ def leave_out_torques(W: Tensor, resting: Tensor, row_std: Tensor | None = None)
 
 
 def triangularize_base_rows(W: Tensor) -> None:
-    """Make bases triangular in the base rows: zero but for three columns in its moment, but for six in its force.
+    """Make bases triangular in the base rows: only three columns contain its moment, only six its force.
 
-    The R of an RQ decomposition, by Householder reflections from the right, one for each base row, in place.
+    Uses the R of an RQ decomposition, by Householder reflections from the right, one for each base row, in place.
 
     Args:
         W: (base rows + coupled joints, r, B).

@@ -65,11 +65,11 @@ def write_gram(
 
 @dataclass(frozen=True)
 class ColumnLevels:
-    """A change of columns, X to X T, after which rows like those it was made of are well conditioned.
+    """A change of columns, X to X T, that makes rows similar to a given sample well conditioned.
 
-    Columns are sorted into levels by pivoted QR, each with pivots of one order of magnitude. Those of the first stay as
-    they are; from each other its best combination of those in the levels above is subtracted. A right-hand side that
-    other columns explain exactly is such a column, and so are those that others determine.
+    Pivoted QR sorts columns into levels, each with pivots of one order of magnitude. The first level does not change.
+    From each other column its best combination of the levels above is subtracted. This includes a right-hand side that
+    other columns explain exactly, and dependent columns.
 
     Attributes:
         T_unit: (n, n), T of columns divided by their lengths.
@@ -109,15 +109,15 @@ class ColumnLevels:
         return np.asarray(inverse * self.size[self.lower] / self.size[:, None])
 
     def apply(self, columns: Array, first: int, write_gram: GramWriter) -> Array | None:
-        """Change columns in place; returns their Gram matrix, (n, n), or None if they were left as they are.
+        """Change columns in place; return their Gram matrix, (n, n), or None if they were not changed.
 
-        They are where one would become much longer: rows that these levels were not made of, in which a column is
-        not as small as in those, and so has a combination that costs others their digits.
+        They are not changed if one would become much longer. The rows then differ from those of the levels, and a
+        combination would cost other columns their digits.
 
         Args:
             columns: (n, first + M), rows by column, contiguous.
-            first: number of rows that are no part of it.
-            write_gram: changes them and multiplies.
+            first: number of rows to skip.
+            write_gram: changes the columns and multiplies.
         """
         gram = np.empty_like(self.T_unit)
         squares = np.empty(len(self.lower))
@@ -129,11 +129,11 @@ class ColumnLevels:
         return None
 
     def are_of(self, gram: Array, squares: Array) -> bool:
-        """Whether rows are like those that these levels were made of, so that none of their columns became much longer.
+        """Whether rows are similar to those of these levels: no changed column became much longer.
 
         Args:
             gram: (n, n), of changed columns.
-            squares: (k,), sums of squares of what the lower columns were.
+            squares: (k,), sums of squares of the lower columns before.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite stays so
             return not np.less(_MOST_GROWTH**2 * squares, gram[self.lower, self.lower]).any()
@@ -230,25 +230,25 @@ def _unit_columns(gram: Array) -> tuple[np.ndarray, Array]:
 
 
 class RowWeighting(Protocol):
-    """Weighs rows, and gathers of them what it needs."""
+    """Weights rows and collects statistics of them."""
 
     def __call__(self, samples: Samples, support: tuple[int, ...], rows: Tensor) -> Tensor:
         """Square roots of the weights, (M, 1), of rows (M, columns + 1) of some samples in some columns."""
 
     def for_worker(self) -> RowWeighting:
-        """The same, which has gathered nothing, for one worker; it pickles."""
+        """An empty copy for a worker; it pickles."""
 
     def add(self, other: Any) -> None:
-        """Add what one for a worker has gathered."""
+        """Add the statistics of a worker's copy."""
 
 
 class RowCompressor:
-    """Adds rows to a triangular factor, which has all of them when this is finished.
+    """Adds rows to a triangular factor, which is complete after `finish`.
 
     A Gram matrix takes a third of the time of Householder QR, but squares the condition number, which costs half of the
-    digits. Here it is one of combined columns (`ColumnLevels`), whose condition is small whatever that of the rows, and
-    it is used only if its least eigenvalue shows that it is as good as QR; rows of which it is not are factorized, and
-    columns then combined anew. Few rows, and all on a GPU and in single precision, are factorized.
+    digits. Here the Gram matrix is one of combined columns (`ColumnLevels`), which are well conditioned. It is used
+    only if its smallest eigenvalue shows that it is as accurate as QR. Otherwise the rows are factorized, and columns
+    combined again. Few rows, and rows on a GPU or in single precision, are always factorized.
     """
 
     def __init__(self, factor: TriangularFactor, write_gram: GramWriter = write_gram) -> None:
@@ -259,11 +259,11 @@ class RowCompressor:
         self._sums: dict[tuple[int, ...], _Sum] = {}
 
     def add(self, support: tuple[int, ...], stacked: Tensor, oversampling: float = 1.0) -> None:
-        """Add rows with room above them.
+        """Add rows with free space above them.
 
         Args:
-            support: the columns in which they are not zero.
-            stacked: as `TriangularFactor.add_in_place` takes it.
+            support: columns in which the rows are not zero.
+            stacked: as for `TriangularFactor.add_in_place`.
             oversampling: rows per independent row, at least 1.
         """
         room = stacked.shape[1]
@@ -286,15 +286,15 @@ class RowCompressor:
         self.factor.count(count, oversampling)
 
     def levels(self, support: tuple[int, ...]) -> ColumnLevels | None:
-        """Those in which rows of a block are added; None before there are any."""
+        """Levels for the rows of a block; None before the first rows."""
         known = self._sums.get(support)
         return None if known is None else known.levels
 
     def add_gram(self, support: tuple[int, ...], squares: Array, gram: Array, count: int, oversampling: float) -> bool:
-        """Add what `GramWriter` writes of so many rows in the present levels, if it may be used.
+        """Add a Gram matrix from `GramWriter`, if it is accurate.
 
         Returns:
-            whether it was; else the rows are to be given to `add`.
+            Whether it was added; otherwise give the rows to `add`.
         """
         known = self._sums[support]
         added = known.levels.are_of(gram, squares) and known.add(gram)
@@ -310,7 +310,7 @@ class RowCompressor:
         self._levels.clear()  # later rows are added as if there had been none, whatever cuts them
 
     def _start(self, support: tuple[int, ...], X: Array) -> _Sum | None:
-        """A sum of nothing, columns combined as for the rows before or by some of these; None if QR is as fast."""
+        """An empty sum, with the column levels of earlier rows or of these; None if QR is as fast."""
         if support not in self._levels:
             sampled = X[:, :: max(1, X.shape[1] // (_ROWS_PER_COLUMN * len(X)))].copy()
             if not np.isfinite(sampled).all():
