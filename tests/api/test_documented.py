@@ -36,8 +36,9 @@ def test_the_page_about_python_runs_and_prints_what_it_shows(
     said, printed = run_page("python.md", tmp_path, capsys)
     assert printed == 2
     assert said["knee"].name == "front_left_shank_link"
-    assert {path.name for path in tmp_path.iterdir()} == {"torchid", "identified.urdf", "runs"}
-    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["from_python"]
+    written = {"identified.urdf", "runs", "checkpoint.pt", "model.pt"}
+    assert {path.name for path in tmp_path.iterdir()} == {"torchid", *written}
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"from_python", "curves"}
 
 
 @pytest.mark.slow("all that the page shows, as it shows it")
