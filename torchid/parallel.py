@@ -1,8 +1,8 @@
-"""Threads of this process, and forks of it, copies by fork(2), that share work between the cores of one machine.
+"""Threads of this process, and forks of it (fork(2)), which share work between the cores of one machine.
 
-Nothing has to be imported by a fork, or handed over to it. Whoever calls torchid as a library may have threads that a
-fork lacks: only the command line allows forks. Processes that share the work of a run (`torchid.distributed`) have no
-forks; they can take the part of these. torch is loaded where it is used, as commands begin without it.
+A fork needs no imports and no copied arguments. A program that uses torchid as a library may have threads, which a fork
+lacks, so only the command line allows forks. Processes that share the work of a run (`torchid.distributed`) have no
+forks, and can replace them. torch is imported only where it is used, because commands start without it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Item = TypeVar("Item")
 
 
 def thread_count() -> int:
-    """Threads that torch would use for one operation, outside of `one_thread`."""
+    """Number of threads that torch uses for one operation, outside of `one_thread`."""
     import torch
 
     return torch.get_num_threads() if _outside is None else _outside
@@ -43,9 +43,9 @@ _outside: int | None = None  # `thread_count` while a block runs with one thread
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run the block with one intra-op thread, of torch and of NumPy's linear algebra.
+    """Run the block with one intra-op thread of torch and of NumPy's linear algebra.
 
-    These arrays are too small to split: on a busy two-core machine two threads made evaluation eight times slower, a
+    The arrays are too small to split. On a busy two-core machine two threads made evaluation eight times slower, a
     consistent estimate three times, and the QR decomposition of 275 rows of 157 columns twenty times.
     """
     import torch
@@ -75,7 +75,7 @@ def _pools() -> ThreadpoolController:
 
 
 def run_in_workers(tasks: Sequence[Item], run: Callable[[Iterator[Item]], T], workers: int) -> list[T]:
-    """Results of `run`, one per worker, each called without gradients on every n-th task; no worker is without one.
+    """Results of `run`, one per worker; each gets every n-th task, without gradients. No worker is without a task.
 
     A failure or an interrupt stops all workers at their next task.
     """
@@ -105,7 +105,7 @@ def run_in_workers(tasks: Sequence[Item], run: Callable[[Iterator[Item]], T], wo
 
 
 def map_in_workers(tasks: Sequence[Item], work: Callable[[Item], T], workers: int | None = None) -> list[T]:
-    """What a function makes of each task, in their order, by threads: by default as many as `thread_count`."""
+    """Apply a function to each task, in order, in threads (by default `thread_count`)."""
     parts = run_in_workers(tasks, lambda share: [work(task) for task in share], workers or thread_count())
     return [parts[number % len(parts)][number // len(parts)] for number in range(len(tasks))]
 
@@ -115,7 +115,7 @@ _allowed = False
 
 @contextmanager
 def forks_allowed() -> Iterator[None]:
-    """Let functions within the block be called by forks of this process, on systems where that is safe."""
+    """Allow functions inside the block to fork this process, on systems where that is safe."""
     global _allowed
     _allowed = sys.platform == "linux"  # libraries of macOS fail in forks, Windows has none
     try:
@@ -125,20 +125,20 @@ def forks_allowed() -> Iterator[None]:
 
 
 def can_fork() -> bool:
-    """Whether forks of this process may be made now."""
+    """Whether this process may fork now."""
     # torchrun has started processes for all cores
     return _allowed and not _uses_a_gpu() and not distributed.is_launched()
 
 
 class Fork(Generic[T]):
-    """A fork of this process that calls a function, in a `with` block at whose end it is gone.
+    """A fork of this process that calls a function; it ends with the `with` block.
 
-    Where forks are not allowed, or the fork meets a warning, an error or its end, this process calls the function
-    itself when it needs the result: it says whatever there is to say.
+    If forks are not allowed, or the fork meets a warning or an error or dies, this process calls the function itself
+    when it needs the result. So all warnings and errors come from this process.
     """
 
     def __init__(self, work: Callable[[], T]) -> None:
-        """Start it; `work`: what it calls; the result pickles."""
+        """Start it; `work`: the function. Its result must pickle."""
         self._work = work
         self._process: multiprocessing.context.ForkProcess | None = None
         self._results: Connection | None = None
@@ -169,7 +169,7 @@ class Fork(Generic[T]):
                 self._process.start()
 
     def result(self) -> T:
-        """What the function returns, or raises."""
+        """The result of the function; raises its error."""
         if self._results is not None:
             with suppress(EOFError, OSError, pickle.UnpicklingError):
                 results: tuple[T, ...] = pickle.loads(self._results.recv_bytes())
@@ -179,12 +179,12 @@ class Fork(Generic[T]):
 
 
 def share_between_forks(items: Sequence[Item], work: Callable[[Item], T], count: int) -> list[T]:
-    """What a function makes of each of some items, in their order; this process works on some, its forks on others.
+    """Apply a function to items, in order; this process works on some, its forks on the others.
 
     Args:
-        items: about the same work each.
-        work: a function of one; its result pickles.
-        count: of processes, this one included.
+        items: with about the same amount of work each.
+        work: the function; its result must pickle.
+        count: number of processes, with this one.
     """
     count = max(min(count, len(items)), 1)
 
@@ -198,9 +198,9 @@ def share_between_forks(items: Sequence[Item], work: Callable[[Item], T], count:
 
 
 def share_between_processes(items: Sequence[Item], work: Callable[[Item], T], count: int) -> list[T]:
-    """As `share_between_forks`; processes that share the work of a run, which all call this, are the forks.
+    """As `share_between_forks`, but between the processes that share the work of a run; all must call it.
 
-    What meets a warning or an error in one of them the first one does again, which alone says things.
+    If an item gives a warning or an error in one of them, the first process repeats it and reports.
     """
     if distributed.world_size() == 1:
         return share_between_forks(items, work, count)
@@ -219,7 +219,7 @@ def share_between_processes(items: Sequence[Item], work: Callable[[Item], T], co
 
 
 def _attempt(work: Callable[[], T]) -> tuple[T, ...]:
-    """What a function returns, alone in a tuple; an empty one where it meets a warning or an error."""
+    """The result of a function in a tuple; an empty tuple if it gives a warning or an error."""
     with suppress(Exception), warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -229,13 +229,13 @@ def _attempt(work: Callable[[], T]) -> tuple[T, ...]:
 
 
 def _uses_a_gpu() -> bool:
-    """Whether this process has a connection to a GPU, which a fork cannot use."""
+    """Whether this process uses a GPU, which a fork cannot use."""
     torch = sys.modules.get("torch")
     return torch is not None and torch.cuda.is_initialized()
 
 
 def _call(work: Callable[[], T], results: Connection, sender: Connection) -> None:
-    """Send what a function returns, or that it did not without a warning."""
+    """Send the result of a function, or that it gave a warning or an error."""
     global _allowed
     _allowed = False
     gc.freeze()  # to look for garbage among what the original has would copy all of it

@@ -107,7 +107,7 @@ def validate_settings(settings: object) -> None:
 
 
 def accepted_values(error: ErrorDetails) -> str:
-    """The accepted values of a type, as text, from the error of a value."""
+    """Text of the accepted values of a type, from the error of a value."""
     count = error.get("ctx", {}).get("min_length", 1)
     plain: Mapping[str, str] = {
         "float_parsing": "a number",

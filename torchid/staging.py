@@ -122,7 +122,7 @@ def staging_folder(target: Path) -> Iterator[Path]:
     """A hidden folder beside `target`, locked by this process and removed after the block, except an `old` in it.
 
     Raises:
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be created.
     """
     handle = -1
     folder = target

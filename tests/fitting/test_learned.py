@@ -47,7 +47,7 @@ def test_what_is_saved_loads_as_tensors_alone_and_gives_the_same_forces(
         RigidPlusResidual.load(path, robot)
     assert "\n" not in str(caught.value)
     learned.save(path)
-    with pytest.raises(InputError, match="of this robot and module"):
+    with pytest.raises(InputError, match="for this robot and module"):
         RigidPlusResidual.load(path, robot, torch.nn.Linear(3, 3))
 
 

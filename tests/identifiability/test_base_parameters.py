@@ -234,7 +234,7 @@ def test_a_hinge_hides_mass_first_moment_along_it_and_one_inertia_as_textbooks_s
 
 
 def test_values_that_fall_without_a_step_are_told() -> None:
-    with pytest.warns(NumericalWarning, match="rank 5: the next singular value is only 100 times smaller"):
+    with pytest.warns(NumericalWarning, match="rank 5 is not clear: the next singular value is only 100 times smaller"):
         assert rank_and_gap(np.geomspace(1.0, 1e-20, 11), tolerance=1e-9) == (5, pytest.approx(100.0))
 
 

@@ -50,7 +50,7 @@ class _Tiles:
 
 
 class _Limbs(NamedTuple):
-    """What `limbs.write_bases` takes of a contact state, in the order of its arguments."""
+    """Arguments of `limbs.write_bases` for a contact state, in order."""
 
     limbs: np.ndarray
     wrenches: Array
@@ -94,7 +94,7 @@ class _BlockTables:
 
     @classmethod
     def of(cls, blocks: tuple[RowBlock, ...], base: int, dofs: int | None) -> _BlockTables:
-        """Of blocks that combine so many degrees of freedom after those of the base; None for one row and one each."""
+        """From blocks, with so many degrees of freedom after those of the base; None for single rows."""
         table = list[list[int]]()
         moved = list[list[int]]()
         ratios = list[float]()
@@ -179,10 +179,10 @@ class _Group:
 
 @dataclass(frozen=True)
 class CompiledChunk:
-    """Rows of a chunk that kernels make when they are asked for, until the workspace is used for others.
+    """Rows of a chunk that kernels compute on request; valid until the workspace is used again.
 
     Attributes:
-        builder: whose rows these are.
+        builder: of the rows.
         samples: of the chunk.
         groups: of blocks.
         workspace: memory.
@@ -202,9 +202,9 @@ class CompiledChunk:
     def grams(
         self, levels: Callable[[tuple[int, ...]], ColumnLevels | None]
     ) -> Iterator[tuple[RowBlock, Array, Array]]:
-        """Blocks, squares and Gram matrices as `GramWriter` writes them, of rows that never leave the caches.
+        """Blocks, squares and Gram matrices as `GramWriter` writes them; the rows never leave the caches.
 
-        Of groups that have levels of all their blocks; of none where rows have more to them than the kernels know.
+        Only for groups with levels of all their blocks, and without parts that kernels do not know.
         """
         if self.samples.payload is None and not self.builder.extras:
             for group in self.groups:
@@ -244,7 +244,7 @@ class CompiledChunk:
             yield block, squares[first : first + count], gram
 
     def _complete(self, made: BlockRows, W: Tensor, in_W: Mapping[int, int]) -> None:
-        """Write what kernels leave out: a known payload, and columns of extra parameters; see `_Group`."""
+        """Add what kernels do not compute: a known payload, and columns of extra parameters; see `_Group`."""
         builder = self.builder
         samples = self.samples
         block = made.block
@@ -260,7 +260,7 @@ class CompiledChunk:
 
 
 class CompiledRows:
-    """Makes the rows of a builder, float64 on a CPU, where no joint rests; extra parameters are those of joints.
+    """Compiled rows of a builder, float64 on a CPU, without resting joints; extra parameters only of joints.
 
     `write_gram`: the kernel that multiplies them.
     """
@@ -268,7 +268,7 @@ class CompiledRows:
     write_gram = staticmethod(write_gram)
 
     def __init__(self, builder: RowBuilder) -> None:
-        """Work out the constants."""
+        """Compute the constants."""
         tree = builder.tree
         self._builder = builder
         self._parent = np.maximum(tree.parents, 0)
@@ -278,7 +278,7 @@ class CompiledRows:
         self._tables_by_blocks: dict[int, _BlockTables] = {}
 
     def chunk(self, samples: Samples, layout: ContactStateLayout, workspace: Workspace) -> CompiledChunk | None:
-        """The rows of a chunk, coupled ones first; None where joints rest or ranks of contacts differ."""
+        """The rows of a chunk, coupled ones first; None if joints rest or ranks of contacts differ."""
         if samples.resting is not None:
             return None
         builder = self._builder

@@ -162,7 +162,7 @@ class LinearProblem:
         rows, columns = self.A.shape
         shapes = (self.b.shape, self.nominal.shape, self.scale.shape, self.free.shape)
         if shapes != ((rows,), (columns,), (columns,), (columns,)):
-            accepted = f"({rows},), then ({columns},) three times, for A of shape ({rows}, {columns})"
+            accepted = f"b of shape ({rows},), the others ({columns},)"
             raise ValueError(f"b, nominal, scale, free: found shapes {shapes}; accepted: {accepted}")
         if self.shrinkage is not None and (len(self.shrinkage) != rows or self.shrinkage.shape[1] < columns):
             accepted = f"({rows}, Q), Q at least {columns}"

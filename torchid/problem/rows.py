@@ -56,7 +56,7 @@ EVERY = slice(None)
 
 
 class Workspace:
-    """Named buffers of one worker, reused: fresh memory for large arrays takes as long as the arithmetic on them."""
+    """Named, reused buffers of one worker (allocating large arrays takes as long as the arithmetic on them)."""
 
     def __init__(self) -> None:
         self._buffers: dict[str, Tensor] = {}
@@ -71,23 +71,23 @@ class Workspace:
 
 
 class Workspaces:
-    """Workspaces of workers that come and go: what one has given back, the next one takes.
+    """Pool of workspaces for workers.
 
-    The first touch of so much memory takes as long as a chunk or two.
+    The first access to new memory takes as long as one or two chunks.
     """
 
     def __init__(self) -> None:
         self._idle: list[Workspace] = []
 
     def take(self) -> Workspace:
-        """One that nobody else has until it is given back."""
+        """Take one that nobody else uses until it is given back."""
         try:
             return self._idle.pop()  # no lock: one bytecode
         except IndexError:
             return Workspace()
 
     def give_back(self, workspace: Workspace) -> None:
-        """Leave one to others; what was read from it is then no longer valid."""
+        """Return one; its arrays are then no longer valid."""
         self._idle.append(workspace)
 
 
@@ -96,20 +96,19 @@ class Workspaces:
 
 @dataclass(frozen=True)
 class Chunk:
-    """B samples with their kinematics, from which predictions, contact Jacobians and rows are computed.
+    """B samples with their kinematics, for predictions, contact Jacobians and rows.
 
     Attributes:
         samples: on the device of the work.
         joints: motion of all joints.
         states: of the joint frames of all nodes.
         screw_axes: (6, L, B), see `joint_screw_axes`.
-        rotation: (B, 3, 3), base to world; None where it was not recorded.
+        rotation: (B, 3, 3), base to world; None if not recorded.
         arms: (3, 3, B) [m] by rolling contact, see `torchid.regressor.regressor.rolling_arms`.
-        ground_axes: (3, 3, B) in base axes by contact that is read along the ground's normal, see
+        ground_axes: (3, 3, B) in base axes by contact with a scalar sensor, see
             `torchid.regressor.regressor.ground_axes`.
-        wrenches: (6, columns, B), wrench at the base origin of a unit of each inertial parameter; no columns in
-            `RowBuilder.kinematics`. The forces of inertias, which are zero, need not have been written, see
-            `RowBuilder.dynamics`.
+        wrenches: (6, columns, B), wrench at the base origin per unit of each inertial parameter; no columns in
+            `RowBuilder.kinematics`. The zero forces of inertias may not be written, see `RowBuilder.dynamics`.
     """
 
     samples: Samples
@@ -126,18 +125,18 @@ class Chunk:
 
     @property
     def resting(self) -> Tensor | None:
-        """Joints whose torque counts as unmeasured, (n, B) bool, see `Samples`; None for none."""
+        """Joints whose torque counts as unmeasured, (n, B) bool, see `Samples`; or None."""
         return None if self.samples.resting is None else self.samples.resting.T
 
     def without_rest(self, forces: Tensor, base_rows: int, value: float = math.nan) -> Tensor:
-        """Generalized forces (M, B, n_rows) with a value in the rows of joints at rest."""
+        """Generalized forces (M, B, n_rows) with a given value in the rows of resting joints."""
         if self.resting is None:
             return forces
         at = nn.functional.pad(self.resting.T, (base_rows, forces.shape[2] - base_rows - len(self.resting)))
         return forces.masked_fill(at, value)
 
     def select(self, index: Tensor | slice) -> Self:
-        """Those of some samples; views by a slice."""
+        """Select samples; a slice gives views."""
         if index == EVERY:
             return self
         return replace(
@@ -160,9 +159,9 @@ class Chunk:
 class BlockRows:
     """Rows of a block at B samples.
 
-    `stacked`: (columns + 1, columns + 1 + r B), the rows by column, the right-hand side last, after room for a factor;
-    `values`: (columns + 1, r, B), the rows in it. `absent`: (r, B) bool, rows of zeros, which a sample has not, as one
-    torque more is unmeasured there; None if all are there.
+    `stacked`: (columns + 1, columns + 1 + r B), the rows by column, right-hand side last, after space for a factor.
+    `values`: (columns + 1, r, B), the rows in it. `absent`: (r, B) bool, rows of zeros of samples with a further
+    unmeasured torque; None without any.
     """
 
     block: RowBlock
