@@ -35,30 +35,30 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ------------------------------------------------------------------------------------------------------------- refusals
 
 REFUSED = {
-    "sensors": (["sensors.set=full"], "sensors: without front_left_foot fx"),
-    "other sensors": (["sensors.set=contacts", "sensors.on_base_lost=warn"], "sensors: without front_left_foot fx"),
+    "sensors": (["sensors.set=full"], "sensors: lacks front_left_foot fx"),
+    "other sensors": (["sensors.set=contacts", "sensors.on_base_lost=warn"], "sensors: lacks front_left_foot fx"),
     "filter": (["preprocessing.cutoff_hz=9"], "preprocessing.cutoff_hz: 8; accepted: 9, as in the experiment file"),
     "no filter": (["preprocessing.cutoff_hz=null"], "preprocessing.cutoff_hz: 8; accepted: none"),
     "margin": (["preprocessing.contact_margin_s=0.1"], "preprocessing.contact_margin_s: none; accepted: 0.1"),
-    "extras": (["sensors.offsets=log"], "sensors.offsets: without offset of front_left_hip, by log"),
-    "scales": (["sensors.scales=all"], "sensors.scales: without scale of front_left_hip, of all logs"),
-    "actuators": (["actuators.armature=true"], "actuators: without armature of front_left_hip"),
+    "extras": (["sensors.offsets=log"], "sensors.offsets: lacks offset of front_left_hip, by log"),
+    "scales": (["sensors.scales=all"], "sensors.scales: lacks scale of front_left_hip, of all logs"),
+    "actuators": (["actuators.armature=true"], "actuators: lacks armature of front_left_hip"),
     "tilt": (["robot.base_tilt=[0.1, 0]"], "robot.base_tilt: none; accepted: 0.1, 0.0, as in the experiment file"),
     "sign": (["actuators.sign_width=0.1"], "actuators.sign_width: none; accepted: 0.1"),
     "delay": (["actuators.delay=0.003"], "actuators.delay: none; accepted: 0.003, as in the experiment file"),
     "contacts": (
         ["contacts=[{frame: front_left_foot, type: point}, {frame: front_right_foot, type: point}]"],
-        "contacts: with rear_left_foot (point), rear_right_foot (point)",
+        "contacts: has also rear_left_foot (point), rear_right_foot (point)",
     ),
     "contact type": (
         ["contacts=[{frame: front_left_foot, type: flat}, {frame: front_right_foot, type: point}, "
          "{frame: rear_left_foot, type: point}, {frame: rear_right_foot, type: point}]"],
-        "contacts: without front_left_foot (flat) and with front_left_foot (point)",
+        "contacts: lacks front_left_foot (flat) and has also front_left_foot (point)",
     ),
     "radius": (
         ["contacts=[{frame: front_left_foot, type: point, radius: 0.02}, {frame: front_right_foot, type: point}, "
          "{frame: rear_left_foot, type: point}, {frame: rear_right_foot, type: point}]"],
-        "contacts: without front_left_foot (point, radius 0.02 m, normal 0.0, 0.0, 1.0) and with front_left_foot (poi",
+        "contacts: lacks front_left_foot (point, radius 0.02 m, normal 0.0, 0.0, 1.0) and has also front_left_foot (po",
     ),
     "base": (["robot.base_link=front_left_hip_link"], "robot.base_link: trunk; accepted: front_left_hip_link"),
 }  # fmt: skip
@@ -151,7 +151,7 @@ def test_another_tree_is_refused_by_the_part_that_differs(
         in message
     )
     renamed = changed_urdf(fleet, tmp_path, lambda text: text.replace('"front_left_thigh_link"', '"upper"'))
-    assert "robot.urdf: without upper (revolute front_left_thigh) and with front_left_thigh_link" in refusal(
+    assert "robot.urdf: lacks upper (revolute front_left_thigh) and has also front_left_thigh_link" in refusal(
         [*experiment, renamed], fleet, capsys
     )
 
@@ -161,7 +161,7 @@ def test_another_tree_is_refused_by_the_part_that_differs(
         return text[:joint] + re.sub(r'xyz="([^"]*) (\S+)"', r'xyz="\1 -0.35"', text[joint:], count=1)
 
     message = refusal([*experiment, changed_urdf(fleet, tmp_path, moved_foot)], fleet, capsys)
-    assert "robot.urdf: contact front_left_foot (point) is " in message
+    assert "robot.urdf: contact front_left_foot (point) differs by " in message
 
 
 # -------------------------------------------------------------------------------------------------------- hostile files

@@ -174,7 +174,7 @@ def test_only_factor_files_are_written_and_read(fleet: Path, tmp_path: Path) -> 
         write_factors(tmp_path / "a.npz", replace(found))
     for name in ("missing.factor", "a.factor"):
         (tmp_path / "a.factor").mkdir(exist_ok=True)
-        with pytest.raises(torchid.TorchidError, match="accepted: a whole .factor file"):
+        with pytest.raises(torchid.TorchidError, match="accepted: a complete .factor file"):
             read_factors(tmp_path / name)
 
 

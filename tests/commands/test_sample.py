@@ -125,7 +125,7 @@ def test_the_answer_says_that_the_prior_is_too_narrow_and_what_fits(
     found = wrong.fitted.nominal_error
     assert found is not None
     assert found.value > 0.6
-    assert f"bodies are off the robot file by {100.0 * found.value:.0f} %" in text
+    assert f"the bodies that the data determine differ from the robot file by {100.0 * found.value:.0f} %" in text
     assert "--prior-error auto" in text
 
 
