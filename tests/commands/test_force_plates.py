@@ -124,4 +124,4 @@ def test_a_plate_that_lies_elsewhere_is_noticed(tmp_path: Path, capsys: pytest.C
     main(["check", str(tmp_path / "walk.npz"), "--urdf", str(folder / "human.urdf")])
     printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "contact_wrench_world, point" in printed
-    assert "check the points of" in printed
+    assert "check the reference points of" in printed

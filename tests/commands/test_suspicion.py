@@ -66,7 +66,7 @@ def test_the_zero_of_an_encoder_is_named_beside_the_parameters(tmp_path: Path) -
 
 def test_the_gear_of_one_joint_is_named_though_masses_make_up_for_a_part_of_it(tmp_path: Path) -> None:
     run = identified(of_joint("joint_torque", lambda torque: 2.0 * torque), tmp_path)
-    assert any(f"joint_torque: {NAME}: the factor that fits" in one for one in answer(run).attention)
+    assert any(f"joint_torque: {NAME}: the URDF fits best with a factor of" in one for one in answer(run).attention)
 
 
 def of_random_torques() -> Log:

@@ -267,8 +267,8 @@ MISTAKES = (
     Mistake("base velocity base for world", _base_velocity, "base_linear_velocity", "frame"),
     Mistake("acceleration with gravity", _gravity, "base_linear_acceleration", "gravity"),
     Mistake("accelerometer reversed", _imu, "imu_specific_force", "revers"),
-    Mistake("accelerometer with gravity twice", _with_gravity(1.0), "imu_specific_force", "gravity is in it twice"),
-    Mistake("accelerometer without gravity", _with_gravity(-1.0), "imu_specific_force", "gravity has been taken out"),
+    Mistake("accelerometer with gravity twice", _with_gravity(1.0), "imu_specific_force", "twice gravity"),
+    Mistake("accelerometer without gravity", _with_gravity(-1.0), "imu_specific_force", "gravity was removed"),
     Mistake("accelerometer along the world's axes", _imu_in_world, "imu_specific_force", "along the world's axes"),
 )
 

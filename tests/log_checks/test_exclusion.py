@@ -148,8 +148,8 @@ def test_a_log_that_is_not_usable_is_refused_in_one_line() -> None:
 @pytest.mark.parametrize(
     ("by", "until", "told"),
     [
-        (0.05, None, r"sway_train.npz: joint_position, step: front_left_knee by 0.0\d+ rad from 249 to 250, .*; split"),
-        (2.0 * np.pi, None, r"joint_position, wrapped angle: front_left_knee by 6.\d+ rad from 249 to 250, "),
+        (0.05, None, r"sway_train.npz: joint_position, step: front_left_knee jumps by 0.0\d+ rad at sample 249-250, .*; split"),
+        (2.0 * np.pi, None, r"joint_position, wrapped angle: front_left_knee jumps by 6.\d+ rad at sample 249-250, "),
         (0.05, 253, None),
         (0.002, None, None),
     ],
@@ -174,7 +174,7 @@ def test_identify_says_that_an_encoder_steps(tmp_path: Path, capsys: pytest.Capt
     assert main(["identify", str(folder / "quadruped.yaml"), f"output={tmp_path / 'run'}"]) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "joint_position, step" in line]
     assert len(told) == 1
-    assert f"sway_train.npz: joint_position, step: {log.joint_names[2]} by 0.0" in told[0]
+    assert f"sway_train.npz: joint_position, step: {log.joint_names[2]} jumps by 0.0" in told[0]
 
 
 def test_identify_and_evaluate_count_what_they_leave_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -94,7 +94,7 @@ def test_the_one_torque_with_another_factor_is_named_with_it(
     log = torques(case.log, lambda torque: torque[:, 1].__imul__(factor))
     finding = only(checked(case, log), name, "joint_torque")
     assert (finding.severity, finding.channels) == (severity, (case.log.joint_names[1],))
-    stated = value(re.search(r"best is (\S+) \+- (\S+?)[:;]", finding.found + ":"))
+    stated = value(re.search(r"with a factor of (\S+) \+- (\S+?)[:;]", finding.found + ":"))
     assert float(stated[1]) == pytest.approx(1.0 / factor, rel=0.15)
 
 
@@ -120,7 +120,7 @@ def test_torques_that_all_have_one_factor_contradict_the_contact_forces(factor: 
     case = case_of(MACHINES[WALKER[0]], WALKER[1])
     found_ = checked(case, scaled(case.log, "joint_torque", factor))
     assert alarms(found_) == [("scale", "joint_torque")]
-    stated = value(re.search("all torques: the factor that fits the URDF best is ([0-9.]+)", found_.findings[0].found))
+    stated = value(re.search("all torques: the URDF fits best with a factor of ([0-9.]+)", found_.findings[0].found))
     assert float(stated[1]) == pytest.approx(1.0 / factor, rel=0.2)
 
 
@@ -131,7 +131,7 @@ def test_a_torque_that_is_friction_alone_is_reversed_where_it_would_drive_its_jo
     assert alarms(of_arm(torques(log, lambda torque: torque[:, 6].__iadd__(friction)))) == []
     finding = only(of_arm(torques(log, lambda torque: torque[:, 6].__isub__(friction))), "sign")
     assert (finding.severity, finding.channels) == (REJECTED, (log.joint_names[6],))
-    assert "friction, which would drive the joint" in finding.found
+    assert "It is mostly friction, which would drive the joint" in finding.found
 
 
 def test_friction_of_the_urdf_that_the_forces_contradict_is_no_mistake_of_the_log() -> None:
@@ -146,7 +146,7 @@ def test_torques_that_are_a_hundredth_are_named_with_their_factor(recorded: tupl
     case = case_of(MACHINES[recorded[0]], recorded[1])
     (finding,) = (x for x in checked(case, scaled(case.log, "joint_torque", 0.01)).findings if x.severity != NOTE)
     assert (finding.name, finding.field) == ("scale", "joint_torque")
-    stated = value(re.search(r"all torques: the factor that fits the URDF best is ([0-9.]+)", finding.found))
+    stated = value(re.search(r"all torques: the URDF fits best with a factor of ([0-9.]+)", finding.found))
     assert float(stated[1]) == pytest.approx(100.0, rel=0.15)
 
 
@@ -322,7 +322,7 @@ def test_an_arm_on_a_table_that_slants_or_on_a_wall_is_told_so() -> None:
     assert re.match(r"gravity is 1[0-4].* about the base's own x and y axes", finding.found)
     wall = only(of_arm(slanting(90.0, "x")), EXPLAINED, "base")
     assert wall.found.startswith("mounted on a wall")
-    assert re.match(r"robot.base_tilt: \[-?1.5708, -?0.0000\]", wall.advice)
+    assert re.match(r"set robot.base_tilt: \[-?1.5708, -?0.0000\]", wall.advice)
 
 
 @pytest.mark.filterwarnings("ignore:.*large part of these accelerations is noise")
@@ -408,14 +408,14 @@ def test_a_world_whose_z_axis_is_level_is_named_with_the_axis_that_points_up() -
     assert finding.found.startswith("in a world whose y axis points up")
     case = case_of(MACHINES["quadruped"], "joints")
     seen = only(checked(case, tilted(case.log, [0.0, 90.0, 0.0])), "gravity", "base_quat_xyzw")
-    assert seen.found.endswith("a world whose x axis points up?")
+    assert seen.found.endswith("Does the world's x axis point up?")
 
 
 @pytest.mark.parametrize(
     ("change", "name", "text"),
     [
-        (-np.eye(3), "sign", "reversed; times -"),
-        (1.6 * np.eye(3), "scale", "times 0.6"),
+        (-np.eye(3), "sign", "fits best with a factor of -"),
+        (1.6 * np.eye(3), "scale", "fits best with a factor of 0.6"),
         (Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix(), "frame", "turned by [23]"),
     ],
     ids=["sign", "gain", "turn"],
@@ -444,7 +444,7 @@ def inverted(log: Log) -> Log:
         (lambda log: scaled(log, "contact_wrench_local", 1e-3), "contact_wrench_local", "in kN"),
         (lambda log: scaled(log, "contact_wrench_local", 1.0 / 9.81), "contact_wrench_local", "in kg"),
         (lambda log: scaled(log, "contact_wrench_local", -1.0), "contact_wrench_local", "all reversed"),
-        (rolled, "base_quat_xyzw", "w first against w last"),
+        (rolled, "base_quat_xyzw", "wrong order: w first and w last are confused"),
         (inverted, "base_quat_xyzw", "rotates world to base"),
     ],
     ids=["kN", "kg", "wrenches reversed", "order", "inverse"],
@@ -479,7 +479,7 @@ def test_a_dead_encoder_is_named_by_its_foot_its_torque_or_its_velocity() -> Non
     log, rng = demo_log(), np.random.default_rng(0)
     knee = next(i for i, name in enumerate(log.joint_names) if "knee" in name)
     foot = only(of_demo(dead(log, knee, 1e-4)), "standing feet", "joint_position")
-    assert f"; {log.joint_names[knee]} of its limb stands still throughout: a dead encoder?" in foot.found
+    assert f". {log.joint_names[knee]} in its limb never moves: is its encoder dead?" in foot.found
     loaded = only(of_arm(dead(arm().log, 1)), "dead encoder", "joint_position")
     assert (loaded.severity, loaded.channels) == (SUSPICIOUS, (arm().log.joint_names[1],))
     rate = np.gradient(log.joint_position, log.time, axis=0) + 0.02 * rng.normal(size=log.joint_position.shape)
@@ -513,7 +513,7 @@ def test_values_of_uninitialised_memory_are_rejected_where_they_are() -> None:
 
 def test_a_floating_base_that_nothing_holds_is_asked_for_its_contacts() -> None:
     bare = replace(demo_log(), contact_names=(), contact_active=None, contact_wrench_local=None)
-    assert "name under contacts" in only(check(bare, demo_robot(), (), 8.0), "forces").advice
+    assert "list under contacts" in only(check(bare, demo_robot(), (), 8.0), "forces").advice
 
 
 def test_a_log_of_another_robot_is_not_usable_and_one_without_a_robot_says_what_was_not_checked() -> None:

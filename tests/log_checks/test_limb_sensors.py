@@ -61,7 +61,7 @@ def test_what_hangs_on_a_sensor_is_no_finding(seen: Seen) -> None:
 def test_an_offset_is_named_with_its_size(seen: Seen) -> None:
     offset = only(seen(lambda wrench: wrench + [3.0, 0.0, 4.0, 0.0, 0.0, 0.0]), "offset")
     assert (offset.severity, offset.field, offset.channels) == (NOTE, "ft_wrench", ("ankle_ft",))
-    assert "a steady 5 N" in offset.found.replace("4.99", "5").replace("5.01", "5")
+    assert "a constant 5 N" in offset.found.replace("4.99", "5").replace("5.01", "5")
     assert "ft_force: log" in offset.advice
 
 
@@ -99,5 +99,5 @@ def test_a_sensor_with_gaps_is_not_judged_and_said_so(seen: Seen) -> None:
     gaps = seen(lambda wrench: np.where(np.arange(len(wrench))[:, None] // 50 % 2 == 0, wrench, np.nan))
     assert not found(gaps, "offset", "ft_wrench")
     assert [one.reason for one in gaps.skipped if one.name == "limb sensors in the air"] == [
-        "ankle_ft: no readings throughout while nothing beyond it touches"
+        "ankle_ft: too few readings while nothing beyond it touches"
     ]

@@ -39,7 +39,7 @@ def test_a_wrench_with_one_component_is_taken_for_a_scalar_sensor_by_name(compon
     finding = only(of_demo(alone(demo_log(), component, (0, 2))), "scalar sensor")
     assert (finding.field, finding.severity) == (FIELD, SUSPICIOUS)
     for foot in (0, 2):
-        assert f"{demo_log().contact_names[foot]}: all but {name} is 0 throughout" in finding.found
+        assert f"{demo_log().contact_names[foot]}: only {name} is ever nonzero" in finding.found
     assert finding.channels == tuple(demo_log().contact_names[foot] for foot in (0, 2))
     assert "contact_force_normal" in finding.advice
     assert "sensors.contact_wrenches: {FRAME: [fn]}" in finding.advice

@@ -51,7 +51,7 @@ def test_the_pose_in_a_left_handed_world_is_named_with_its_axis(axis: int) -> No
     quat, position = value(log.base_quat_xyzw) * [*-signs, 1.0], value(log.base_position_world) * signs
     (finding,) = findings(replace(log, base_quat_xyzw=quat, base_position_world=position))
     assert (finding.severity, finding.field) == (REJECTED, "base_quat_xyzw")
-    assert f"left-handed world, whose {'xyz'[axis]} axis is reversed" in finding.found
+    assert f"left-handed world: its {'xyz'[axis]} axis is reversed" in finding.found
 
 
 @pytest.mark.parametrize(
@@ -173,4 +173,4 @@ def test_the_one_foot_whose_encoder_is_off_is_named(scale: float, zero: float) -
     assert (finding.name, finding.severity, finding.field) == ("standing feet", SUSPICIOUS, "joint_position")
     limb = ROBOT.joint_names[joint].removesuffix("_knee")
     assert finding.channels == (f"{limb}_foot",)
-    assert finding.found.startswith(f"{limb}_foot moves though it stands")
+    assert finding.found.startswith(f"{limb}_foot moves though its flag is on")

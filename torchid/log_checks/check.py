@@ -113,7 +113,7 @@ class Checked:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why the log cannot be used; empty if it can."""
+        """Reasons why the log is not usable; empty if it is."""
         whole = tuple(f"{f.field}: {f.name}" for f in self.findings if f.rejects_all)
         share = float(self.rejected.mean()) if len(self.log) else 1.0
         if not whole and share > MAX_REJECTED_SHARE:
@@ -144,11 +144,11 @@ def check(
         log: as `read_log` returns it, with or without gaps.
         robot: the robot; without one, checks against its URDF are skipped.
         contacts: of the robot.
-        cutoff_hz: cutoff [Hz] of the filter that the log will be preprocessed with; None for the default.
-        derived: how names of fields begin that were not recorded, which are not to blame for anything. contact_active:
-            of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
-            stand; forces are compared with the URDF in the longest segment in which enough of them do.
-        declared: what an experiment says of noise, delay and unknown scales and offsets; None: nothing.
+        cutoff_hz: cutoff [Hz] of the filter for preprocessing; None for the default.
+        derived: prefixes of fields that torchid computed; no finding blames them. contact_active: flags come from
+            torques. base_: the base's motion comes from standing feet; forces are compared with the URDF in the longest
+            segment in which enough feet stand.
+        declared: noise, delay, and unknown scales and offsets of an experiment; None: nothing is declared.
         required: sensors of a fit, which must be in the log; None for any.
     """
     log, unclosed = completed(without_welded_joints(log, robot), robot)
@@ -229,7 +229,7 @@ def _longest_standing(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tu
 
 
 def _was_interpolated(finding: Finding | Skipped, missing: Sequence[Finding]) -> bool:
-    """Whether all values of a finding stand where none was recorded: what was filled in at the ends repeats."""
+    """Whether the finding concerns interpolated values only: values filled in at the ends repeat."""
     if isinstance(finding, Skipped):
         return False
     holes = [span for x in missing if x.field == finding.field for span in x.spans]
@@ -241,7 +241,7 @@ def _was_interpolated(finding: Finding | Skipped, missing: Sequence[Finding]) ->
 
 
 def _between_holes(log: Log, filled: BoolArray) -> Log:
-    """The longest part of a repaired log without holes so long that what was `filled` in (N,) is no motion."""
+    """The longest part of a repaired log without long holes; samples `filled` (N,) in long holes show no motion."""
     edges = np.flatnonzero(np.diff(filled, prepend=False, append=False))
     first = edges[::2]
     last = edges[1::2]
@@ -269,7 +269,7 @@ def _blocking_finding(results: Iterable[Finding | Skipped]) -> Finding | None:
 
 
 def _skip_dependent(blocking: Finding) -> Skipped:
-    return Skipped("all further checks", f"{blocking.field} is rejected throughout: {blocking.name}")
+    return Skipped("all further checks", f"all samples of {blocking.field} are rejected: {blocking.name}")
 
 
 def _collect(log: Log, repaired: Log, results: Sequence[Finding | Skipped]) -> Checked:
@@ -374,7 +374,7 @@ def excluded_stamps(checked: Checked, time: FloatArray, cutoff_hz: float | None,
 
 
 def drop_rejected(samples: Samples, checked: Checked, cutoff_hz: float | None, derived: bool) -> Samples:
-    """The samples that rejected samples do not affect; see `excluded_stamps`.
+    """The samples without those near rejected samples; see `excluded_stamps`.
 
     Raises:
         LogError: the log is not usable, or no sample is left.
@@ -391,7 +391,7 @@ def drop_rejected(samples: Samples, checked: Checked, cutoff_hz: float | None, d
         return samples
     reasons = _exclusion_reasons(checked)
     if excluded.all():
-        raise LogError(source, "preprocessing.exclude_rejected", f"no sample left: {reasons}", "a longer log")
+        raise LogError(source, "preprocessing.exclude_rejected", f"all samples are excluded: {reasons}", "a longer log")
     warn(f"{log_title(source)}: {excluded.sum()} of {len(samples)} samples excluded: {reasons}")
     return samples[torch.from_numpy(np.flatnonzero(~excluded))]
 

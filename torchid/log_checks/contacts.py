@@ -69,7 +69,7 @@ _ACCELEROMETER_CHECK = "accelerometer at rest"
 
 
 def check_weight(log: Log, robot: Robot | None, scaled: bool = False) -> Iterator[Finding | Skipped]:
-    """Findings about the sum of the contact forces; notes where these have an unknown scale by the experiment."""
+    """Findings about the sum of the contact forces; `scaled`: their scale is unknown, so findings are notes."""
     if robot is not None and robot.fixed_base and not log.contact_names:
         return  # the mounting carries the weight
     still = _find_rest(log)
@@ -93,46 +93,46 @@ def check_weight(log: Log, robot: Robot | None, scaled: bool = False) -> Iterato
 def _weight_findings(carried: float, when: str, field: str, robot: Robot | None) -> Iterator[Finding]:
     mass = carried / GRAVITY
     if carried < 0.0:
-        text = f"contacts pull with {-carried:.4g} N {when}"
-        yield Finding("sign", REJECTED, field, text, "reverse it: wrenches are what the ground exerts on the robot")
+        text = f"contacts pull the robot down with {-carried:.4g} N {when}"
+        yield Finding("sign", REJECTED, field, text, "reverse the wrenches: give what the ground exerts on the robot")
         return
     if robot is None:
         text = f"contacts carry {mass:.4g} kg {when}"
-        yield Finding("weight", NOTE, field, text, "compare with a scale, or give the robot")
+        yield Finding("weight", NOTE, field, text, "weigh the robot and compare, or give its file (--urdf)")
         return
     nominal = float(robot.nominal[:, 0].sum())
     ratio = mass / nominal
     more = format_percent(ratio - 1.0, "+")
-    text = f"contacts carry {mass:.4g} kg {when}, the {robot.format} weighs {nominal:.4g} kg ({more} %)"
+    text = f"contacts carry {mass:.4g} kg {when}, but the {robot.format} has {nominal:.4g} kg ({more} %)"
     if units := units_of_ratio(ratio, ("force",)):
-        text = f"contacts carry {ratio:.3g} of the weight {when}: forces in {' or '.join(units)}?"
+        text = f"contacts carry {ratio:.3g} times the robot's weight {when}. Are forces in {' or '.join(units)}?"
         yield Finding("unit", REJECTED, field, text, "convert forces to N and moments to N m")
         return
     if abs(ratio - 1.0) > MAX_MASS_ERROR:
-        advice = "check for an unmeasured contact, a payload, an offset or gain of a sensor"
-        advice += f", and whether the {robot.format} is that of this robot" * (not 0.5 < ratio < 2.0)
+        advice = "check for an unmeasured contact, a payload, a sensor offset and a wrong gain"
+        advice += f"; check that the {robot.format} describes this robot" * (not 0.5 < ratio < 2.0)
         yield Finding("weight", SUSPICIOUS, field, text, advice)
     elif abs(ratio - 1.0) > MIN_NOTED_MASS_ERROR:
-        advice = f"none if the {robot.format} may have this error; an offset of a sensor has the same effect"
+        advice = f"nothing if the {robot.format} may have this error. A sensor offset has the same effect"
         yield Finding("weight", NOTE, field, text, advice)
 
 
 def _vertical_force(log: Log, robot: Robot | None) -> FloatArray | str:
-    """Sum of the vertical contact forces (M,) [N] where all active contacts were measured, or why there is none."""
+    """Sum of the vertical contact forces (M,) [N] where all active contacts were measured, or why it is unknown."""
     wrench = log.contact_wrench
     if wrench is None or log.contact_active is None:
-        return "no contact forces"
+        return "the log has no contact forces"
     force = np.where(log.contact_active[..., None], wrench[..., :3], 0.0)
     if log.contact_wrench_world is None:
         if robot is None:
-            return "contact forces along the contact frames' axes, and no robot"
+            return "wrenches in contact frames need a robot (--urdf)"
         if log.base_quat_xyzw is None and not robot.fixed_base:
-            return "contact forces along the contact frames' axes, and no orientation of the base"
+            return "wrenches in contact frames need the orientation of the base"
         if set(log.joint_names) != set(robot.joint_names) or not set(log.contact_names) <= set(robot.links):
-            return "the log's joints or contacts are not the robot's"
+            return "the log and the robot have different joints or contacts"
         force = _rotate_to_world(log, robot, force)
     known = np.isfinite(force).all(axis=(1, 2))
-    return force[known, :, 2].sum(axis=1) if known.any() else "no sample at which all active contacts were measured"
+    return force[known, :, 2].sum(axis=1) if known.any() else "no sample has the forces of all active contacts"
 
 
 def _rotate_to_world(log: Log, robot: Robot, force: FloatArray) -> FloatArray:
@@ -162,7 +162,7 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
     used = still if rests else np.ones(len(log), bool)
     mean = float(np.linalg.norm(reading[used].mean(axis=0)))
     size = mean if rests else float(np.median(np.linalg.norm(reading, axis=1)))
-    text = f"{size:.4g} m/s^2 {'at rest' if rests else 'in the median'}"
+    text = f"the accelerometer reads {size:.4g} m/s^2 {'at rest' if rests else 'in the median'}"
     by_mean, by_size = (
         units_of_ratio(x / GRAVITY, ("acceleration",), _ACCELEROMETER_UNIT_TOLERANCE) for x in (mean, size)
     )
@@ -185,18 +185,19 @@ def _gravity_finding(mean: float, size: float, text: str, units: tuple[str, ...]
     Both are gravity's for a base that hardly turns and falls; of one without gravity, the mean is nearly zero.
     """
     field = "imu_specific_force"
-    original = "give the reading of the accelerometer"
+    original = "give the raw reading of the accelerometer"
     if units:
-        advice = f"{advise_units({field: units})}; without a map convert it to m/s^2"
-        return Finding("unit", REJECTED, field, f"{text.replace(' m/s^2', '')}: in {' or '.join(units)}", advice)
+        text = f"{text.replace(' m/s^2', '')}. Is the unit {' or '.join(units)}?"
+        return Finding("unit", REJECTED, field, text, f"{advise_units({field: units})}, or convert it to m/s^2")
     if mean < _MAX_MEAN_WITHOUT_GRAVITY * GRAVITY and size < _MAX_SIZE_WITHOUT_GRAVITY * GRAVITY:
-        advice = f"{original}: acceleration minus gravity, upward at rest"
-        return Finding("gravity", REJECTED, field, f"{text}: gravity has been taken out", advice)
+        advice = f"{original}: acceleration minus gravity, 9.81 m/s^2 upward at rest"
+        return Finding("gravity", REJECTED, field, f"{text}: gravity was removed", advice)
     if max(abs(x / (2.0 * GRAVITY) - 1.0) for x in (mean, size)) < _ACCELEROMETER_UNIT_TOLERANCE:
-        advice = f"{original}, to which nothing was added; or halve it, if its range is another"
-        return Finding("gravity", REJECTED, field, f"{text}: gravity is in it twice", advice)
+        advice = f"{original}, without added gravity; or halve it if the sensor's range is half of what was assumed"
+        return Finding("gravity", REJECTED, field, f"{text}: twice gravity", advice)
     if rests and abs(size / GRAVITY - 1.0) > _MAX_ACCELEROMETER_ERROR:
-        return Finding("gravity", SUSPICIOUS, field, f"{text}, gravity is {GRAVITY}", "calibrate the accelerometer")
+        text += f", but gravity is {GRAVITY}"
+        return Finding("gravity", SUSPICIOUS, field, text, "calibrate the accelerometer")
     return None
 
 
@@ -228,7 +229,7 @@ def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -
         return
     read = _specific_force_in_base(log, robot)
     if read is None or robot is None:
-        yield Skipped("gravity against orientation", "no robot with the IMU's frame on the base")
+        yield Skipped("gravity against orientation", "needs a robot with imu_frame on its base link")
         return
     in_base = read[still]
     up = rotate_to_world(log.base_quat_xyzw[still], in_base).mean(axis=0)
@@ -237,25 +238,25 @@ def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -
     angles = np.degrees(np.arccos(np.clip(up / np.linalg.norm(up), -1.0, 1.0)))
     angle = float(angles[2])
     name = "imu_specific_force"
-    text = f"{angle:.3g} degrees from up {when}, by base_quat"
+    text = f"the accelerometer's up is {angle:.3g} degrees from up by base_quat {when}"
     if (level := int(np.argmin(angles))) < 2 and angles[level] < _MAX_TILT_DEG:
-        advice = f"turn the world so that z points up; else check the IMU's frame in the {robot.format}"
-        text = f"imu_specific_force {text}: a world whose {'xy'[level]} axis points up?"
+        advice = f"rotate the world so that z points up, or check imu_frame in the {robot.format}"
+        text += f". Does the world's {'xy'[level]} axis point up?"
         yield Finding("gravity", SUSPICIOUS, "base_quat_xyzw", text, advice)
         return
     if angle <= 90.0:
         if angle > _MAX_TILT_DEG:
-            advice = f"check the IMU's frame in the {robot.format} and the order of the quaternion"
+            advice = f"check imu_frame in the {robot.format} and the order of the quaternion"
             yield Finding("gravity", SUSPICIOUS, name, text, advice)
         return
     height = _height_above_feet(log.select(np.flatnonzero(still)), robot, in_base)
     if height is None or height < 0.0:
-        below = "" if height is None else ", and the base hangs below the feet that carry it"
-        advice = "reverse it if it is gravity minus acceleration; else check the IMU's frame and the quaternion's order"
-        yield Finding("gravity", REJECTED, name, f"{text}{below}: reversed?", advice)
+        below = "" if height is None else ", and the base hangs below its feet"
+        advice = "reverse it if it is gravity minus acceleration, or check imu_frame and the order of the quaternion"
+        yield Finding("gravity", REJECTED, name, f"{text}{below}. Is the reading reversed?", advice)
     else:
-        text = f"imu_specific_force {text}, and the base is above its feet: a world whose z axis points down?"
-        advice = "rotate the world so that z points up; else check the order of the quaternion"
+        text += ", and the base is above its feet. Does the world's z axis point down?"
+        advice = "rotate the world so that z points up, or check the order of the quaternion"
         yield Finding("gravity", REJECTED, "base_quat_xyzw", text, advice)
 
 
@@ -344,27 +345,27 @@ class _Contact:
 def check_contact_flags(log: Log, robot: Robot | None = None) -> Iterator[Finding | Skipped]:
     """Findings about contact flags and sensor offsets, relative to the total load: forces may be in any unit.
 
-    Where no flag ever lets a contact carry, forces tell a robot that stands from one in the air by the URDF's weight.
+    If no contact ever carries a load with its flag on, the URDF's weight tells a standing robot from one in the air.
     """
     if not log.contact_names:
         return
     contacts = list(_contacts(log))
     if not contacts:
-        yield Skipped(_FLAG_CHECK, "no contact whose force was measured whenever it touches")
+        yield Skipped(_FLAG_CHECK, "every contact lacks its force in some samples of contact")
         return
     judged = {contact.name for contact in contacts}
     for name in (name for name in log.contact_names if name not in judged):
-        yield Skipped(_FLAG_CHECK, f"{name}: its force was not measured whenever it touches")
+        yield Skipped(_FLAG_CHECK, f"{name}: its force is missing in some samples of contact")
     weight = _largest_load(contacts) or _load_without_flags(contacts, robot)
     if not weight > 0.0:
-        yield Skipped(_FLAG_CHECK, "no contact carries anything while it touches")
+        yield Skipped(_FLAG_CHECK, "no contact carries a force while its flag is on")
         return
     for contact in contacts:
         offset = _offset(contact)
         size = np.linalg.norm(contact.force - offset, axis=1)
         if (constant := float(np.linalg.norm(offset))) > MIN_ACTIVE_WEIGHT_SHARE * weight:
-            text = f"{contact.name}: reads a steady {constant:.3g} N in the air"
-            advice = "identify it, sensors.offsets: {contact_force: log}, or subtract it, preprocessing.zero_in_air"
+            text = f"{contact.name}: reads a constant {constant:.3g} N in the air"
+            advice = "set sensors.offsets: {contact_force: log} to identify it, or preprocessing.zero_in_air: true"
             yield Finding("offset", NOTE, "contact_wrench", text, advice, (contact.name,))
         yield from _load_findings(log, contact, size, weight)
         yield from _delay_findings(log, contact, size, weight)
@@ -433,8 +434,8 @@ def _load_findings(log: Log, contact: _Contact, size: FloatArray, weight: float)
     loaded = ~contact.active & (size > MAX_INACTIVE_WEIGHT_SHARE * weight)
     if loaded.any():
         samples = format_count(int(loaded.sum()), "sample")
-        text = f"{contact.name}: inactive with up to {size[loaded].max():.3g} N, in {samples}"
-        advice = "set the flag where there is a force: forces of inactive contacts are ignored"
+        text = f"{contact.name}: carries up to {size[loaded].max():.3g} N while its flag is off, in {samples}"
+        advice = "set the flag there: forces of contacts without a flag are ignored"
         spans = tuple(find_spans(loaded, contact.name))
         yield Finding("force without contact", REJECTED, "contact_active", text, advice, (contact.name,), spans)
     longest = max(1, round(_MAX_UNLOADED_S / median_step(log)))
@@ -443,12 +444,12 @@ def _load_findings(log: Log, contact: _Contact, size: FloatArray, weight: float)
     spans = tuple(span for span in find_spans(unloaded, contact.name) if len(span) > longest)
     if spans:
         samples = format_count(sum(len(span) for span in spans), "sample")
-        never = " though the flag never changes" if contact.active.all() else ""
-        text = f"{contact.name}: active without a force (below {threshold:.2g} N) in {samples}{never}"
-        advice = "clear the flag where the foot is in the air: it removes data, but causes no error"
+        never = "; the flag never changes" if contact.active.all() else ""
+        text = f"{contact.name}: carries less than {threshold:.2g} N while its flag is on, in {samples}{never}"
+        advice = "clear the flag while the foot is in the air. A wrong flag costs data, not accuracy"
         if np.mean(contact.force[contact.active].any(axis=1)) < _MOST_READ_OF_DEAD_SHARE:
-            text = f"{contact.name}: its sensor reads 0 in {samples} in which it is active: dead, or of another column"
-            advice = "leave it out: name the others in sensors.contact_wrenches; or mend the column or flags in the air"
+            text = f"{contact.name}: its sensor reads 0 in {samples} with its flag on: it is dead or its column wrong"
+            advice = "list only the other contacts in sensors.contact_wrenches, or correct the column or the flags"
         yield Finding("contact without force", SUSPICIOUS, "contact_active", text, advice, (contact.name,), spans)
 
 
@@ -482,7 +483,7 @@ def _delay_findings(log: Log, contact: _Contact, size: FloatArray, weight: float
 
 
 def check_scalar_wrenches(log: Log) -> Iterator[Finding]:
-    """Findings about wrenches of which one force alone is ever other than 0: a scalar sensor's reading among zeros."""
+    """Findings about wrenches in which a single force is ever nonzero: a scalar sensor's reading among zeros."""
     wrench = log.contact_wrench
     active = log.contact_active
     if wrench is None or active is None:
@@ -493,10 +494,10 @@ def check_scalar_wrenches(log: Log) -> Iterator[Finding]:
         forces = np.flatnonzero(present[:3])
         if len(forces) != 1 or present[3:].any() or np.isnan(touching[:, :3]).any():
             continue
-        text = f"{name}: all but {WRENCH_COMPONENTS[forces[0]]} is 0 throughout, as of a scalar sensor"
+        text = f"{name}: only {WRENCH_COMPONENTS[forces[0]]} is ever nonzero, as from a scalar sensor"
         advice = (
-            f"give it as {FORCE_NORMAL}, with sensors.contact_wrenches: {{FRAME: [fn]}}: zeros are fitted as measured "
-            "forces along the frame's axes"
+            f"give it as {FORCE_NORMAL} and set sensors.contact_wrenches: {{FRAME: [fn]}}. "
+            "Else the zeros are fitted as measured forces"
         )
         yield Finding("scalar sensor", SUSPICIOUS, log.contact_wrench_field, text, advice, (name,))
 
@@ -504,19 +505,19 @@ def check_scalar_wrenches(log: Log) -> Iterator[Finding]:
 # -------------------------------------------------------------------------------------------------------------- slip
 
 MOST_SLIPPING_SHARE = 0.3
-"""Of a contact's samples: where more of them slip it is no slip, but wrong flags, radii or another motion."""
+"""Share of a contact's samples; if more slip, the cause is wrong flags, wrong radii or another motion."""
 
 CLEAR_SLIP = 2.0
-"""Times its limit that a contact that is named moves at its fastest: noise of cameras and encoders has long tails."""
+"""Least peak speed over the limit for a finding: noise of cameras and encoders has long tails."""
 
 _SLIP_CHECK = "slip of contacts"
-_ADVICE = "preprocessing.max_slip: auto leaves these samples out; look for dust, a soft floor or flags that are late"
+_ADVICE = "set preprocessing.max_slip: auto to exclude these samples; look for dust, a soft floor or late flags"
 
 
 def check_slip(
     log: Log, robot: Robot | None, contacts: Sequence[Contact], cutoff_hz: float | None, derived: tuple[str, ...] = ()
 ) -> Iterator[Finding | Skipped]:
-    """Findings about contacts that slip; none on flags, or with a base's motion, that torchid made."""
+    """Findings about contacts that slip; none if torchid computed the flags or the base's motion."""
     if robot is None or not contacts or log.contact_active is None:
         return
     if derived:
@@ -542,10 +543,10 @@ def check_slip(
         standing += np.isfinite(slip.speed).sum(axis=0)
         fastest = np.maximum(fastest, np.nanmax(slip.speed / slip.limits, axis=0, initial=0.0))
     if not checked:
-        yield Skipped(_SLIP_CHECK, "neither the base's linear velocity nor two contacts that stand at once")
+        yield Skipped(_SLIP_CHECK, "needs the base's linear velocity, or two contacts that stand at the same time")
     for contact, own, stands, peak in zip(contacts, slips.T, standing.tolist(), fastest.tolist(), strict=True):
         if peak >= CLEAR_SLIP and own.sum() <= MOST_SLIPPING_SHARE * stands:
-            text = f"{contact.frame} moves on the ground in {int(own.sum())} samples"
+            text = f"{contact.frame} slips on the ground in {int(own.sum())} samples"
             yield Finding("slip", SUSPICIOUS, "contact_active", text, _ADVICE, (contact.frame,), tuple(find_spans(own)))
 
 
@@ -587,9 +588,9 @@ def check_limb_sensors(
         beyond = _contacts_beyond(robot, contacts, name)
         air = ~active[:, beyond].any(axis=1) & np.isfinite(measured).all(axis=1)
         if not beyond and not robot.fixed_base and not contacts:
-            yield Skipped(_LIMB_SENSOR_CHECK, "no contacts, of which one might be beyond a sensor")
+            yield Skipped(_LIMB_SENSOR_CHECK, "needs contacts: one of them may load the limb beyond the sensor")
         elif air.sum() < _MIN_AIR_SAMPLES:
-            yield Skipped(_LIMB_SENSOR_CHECK, f"{name}: no readings throughout while nothing beyond it touches")
+            yield Skipped(_LIMB_SENSOR_CHECK, f"{name}: too few readings while nothing beyond it touches")
         else:
             yield from _limb_sensor_findings(name, measured[air], model[air], robot)
 
@@ -619,18 +620,18 @@ def _limb_sensor_findings(name: str, measured: FloatArray, model: FloatArray, ro
     product = float((x * y).sum())
     correlated = abs(product) > _MIN_CORRELATION * np.linalg.norm(x) * np.linalg.norm(y)
     if not correlated and (turned := _turned_sensor(measured, model)) is not None:
-        text = f"{name}: in the air it reads what hangs on it by the {robot.format} along axes turned by right angles"
-        advice = f"turn forces and moments into the joint's child frame, whose {turned}"
+        text = f"{name}: in the air it reads the {robot.format}'s load beyond it, along axes rotated by right angles"
+        advice = f"rotate forces and moments into the joint's child frame: its {turned}"
         yield Finding("frame", SUSPICIOUS, "ft_wrench", text, advice, (name,))
         return
     gain = product / float(np.square(x).sum()) if correlated else 1.0
-    text = f"{name}: in the air it reads {gain:.3g} times what hangs on it by the {robot.format} ({weight:.3g} N)"
+    text = f"{name}: in the air it reads {gain:.3g} times the {robot.format}'s load beyond it ({weight:.3g} N)"
     if gain < 0.0:
-        advice = "reverse it: the wrench that the parent side exerts on the child side"
+        advice = "reverse it: give the wrench that the parent side exerts on the child side"
         yield Finding("sign", REJECTED, "ft_wrench", text, advice, (name,))
         return
     if abs(gain - 1.0) > MAX_MASS_ERROR:
-        advice = "check the sensor's unit and gain, and the load that is mounted beyond it"
+        advice = "check the sensor's unit and gain, and the load mounted beyond it"
         yield Finding("weight", SUSPICIOUS, "ft_wrench", text, advice, (name,))
     residual = measured - gain * model
     offset = np.median(residual, axis=0)
@@ -642,8 +643,7 @@ def _limb_sensor_findings(name: str, measured: FloatArray, model: FloatArray, ro
     if not separate:
         threshold += MAX_MASS_ERROR * weight
     if size > max(threshold, spread):
-        hanging = f"the {weight:.3g} N that hang on it by the {robot.format}"
-        text = f"{name}: reads a steady {size:.3g} N in the air beside {hanging}"
-        ambiguity = "" if separate else "; a load of that weight would look the same"
-        advice = f"identify it, sensors.offsets: {{ft_force: log}}, or subtract it{ambiguity}"
+        text = f"{name}: in the air it reads a constant {size:.3g} N beside the {robot.format}'s load ({weight:.3g} N)"
+        ambiguity = "" if separate else ". A load of that weight has the same effect"
+        advice = f"set sensors.offsets: {{ft_force: log}} to identify it, or subtract it{ambiguity}"
         yield Finding("offset", NOTE, "ft_wrench", text, advice, (name,))

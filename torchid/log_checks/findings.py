@@ -88,13 +88,14 @@ class Finding:
         return mask
 
 
-UNEXPLAINED = ", and no usual mistake explains it"
-"""How a finding ends, or goes on, that names no mistake."""
-_EXPLAINING_SHARE = 0.05  # of the samples, on which a finding may be the reason of another one on all
+EXCLUDE_ADVICE = "exclude these samples (preprocessing.exclude_rejected: true)"
+UNEXPLAINED = "; no usual mistake explains it"
+"""End of a finding that names no mistake."""
+_EXPLAINING_SHARE = 0.05  # of the samples: a finding on more of them may explain a finding on all samples
 
 
 def explained(findings: Sequence[Finding], samples: int) -> list[Finding]:
-    """Findings of which those that name no mistake refer to others beside them that do."""
+    """The findings; those without a known mistake refer to those with one."""
     named = [
         f"{finding.name} of {finding.field}"
         for finding in findings
@@ -107,7 +108,7 @@ def explained(findings: Sequence[Finding], samples: int) -> list[Finding]:
 
 
 def refused(error: InputError) -> Finding:
-    """A finding about a log that a fit would refuse with this error."""
+    """The finding for an error with which a fit would refuse this log."""
     return Finding("does not fit", REJECTED, error.field, error.found, f"give {error.accepted}")
 
 
@@ -185,7 +186,7 @@ def median_step(log: Log) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ChannelGroup:
-    """Channels of one field, of all joints, of the base, or of one contact, where they were measured.
+    """The measured channels of all joints, of the base, or of one contact, in one field.
 
     Attributes:
         field: of the log.
@@ -231,7 +232,7 @@ def channel_unit(field: str, name: str) -> str:
 
 
 def channel_groups(log: Log, fields: Sequence[str] | None = None) -> Iterator[ChannelGroup]:
-    """All groups of a log that are not empty; `fields`: of these alone."""
+    """All groups of a log that are not empty; `fields`: only of these fields."""
     for field in log.arrays():
         if field in NON_SIGNAL_FIELDS or not (fields is None or field in fields):
             continue

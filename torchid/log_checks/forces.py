@@ -32,7 +32,7 @@ from torchid.log_checks.equations import (
 )
 from torchid.log_checks.findings import NOTE, REJECTED, SUSPICIOUS, UNEXPLAINED, Finding, Skipped, median_step, refused
 from torchid.log_checks.mistakes import Mistake, joint_mistakes, possible_mistakes
-from torchid.log_checks.motion import still_joints
+from torchid.log_checks.motion import DEAD_ENCODER_ADVICE, still_joints
 from torchid.log_checks.unknowns import (
     MIN_UNEXPLAINED,
     READINGS,
@@ -137,10 +137,9 @@ def _lost_base(samples: Samples, builder: RowBuilder) -> Iterator[Finding]:
     usual = {name: int(torch.cat(ranks[name]).median()) for name, _ in counts.most_common()}
     if lost := {name: rank for name, rank in usual.items() if rank < 6}:
         named = "; ".join(f"{name}: rank {rank} of 6" for name, rank in list(lost.items())[:_NAMED])
-        more = f"; and {len(lost) - _NAMED} contact states more" if len(lost) > _NAMED else ""
-        text = f"the base is lost, rank(S_b V_x) < 6, in contact with {named}{more}"
-        advice = "measure more (torchid analyze finds what suffices), leave such samples out, or set"
-        advice += " sensors.on_base_lost: warn"
+        more = f"; and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
+        text = f"the base is lost, rank(S_b V_x) < 6, in these contact states: {named}{more}"
+        advice = "add sensors (torchid analyze finds a set), exclude these samples, or set sensors.on_base_lost: warn"
         yield Finding("does not fit", REJECTED, "sensors", text, advice)
 
 
@@ -187,7 +186,7 @@ def check_forces_against_urdf(
         yield from check_required(samples, robot, contacts, required, model.declared.goes_on_without_base)
     filtered = _with_declared_scales(filtered)
     if filtered.equations is None:
-        yield Skipped(_FORCE_CHECK, "neither joint torques nor contact wrenches")
+        yield Skipped(_FORCE_CHECK, "the log has neither joint torques nor contact wrenches")
     else:
         yield from _mistakes(filtered, filtered.equations, derived)
 
@@ -288,26 +287,26 @@ def implausible_bodies(robot: Robot) -> Iterator[ImplausibleBody]:
             fault = "one moment of inertia larger than the sum of the two others, or negative"
             yield ImplausibleBody(number, fault, of_mass=False)
         elif (radius := np.sqrt(0.5 * trace / mass[number])) > length > 0.0:
-            yield ImplausibleBody(number, f"a radius of gyration of {radius:.2g} m, beyond the robot's {length:.2g} m")
+            yield ImplausibleBody(number, f"a radius of gyration of {radius:.2g} m in a robot of {length:.2g} m")
         elif not _MIN_DENSITY < (density := mass[number] / (_BALL_VOLUME * max(radius, _TINY) ** 3)) < _MAX_DENSITY:
-            yield ImplausibleBody(number, f"a density of {density:.2g} kg/m^3 if it is a ball")
+            yield ImplausibleBody(number, f"a density of {density:.2g} kg/m^3 as a ball")
         elif 2 * isotropic[f"{least:.4g}"] > max(len(bodies), _MIN_BODIES):
-            fault = f"moments of inertia of {least:.3g} kg m^2 about all axes, as most bodies"
+            fault = f"moments of inertia of {least:.3g} kg m^2 about all axes, like most bodies"
             yield ImplausibleBody(number, fault, of_mass=False)
 
 
 def _inertials_finding(bodies: Sequence[ImplausibleBody], robot: Robot, severity: str) -> Finding:
-    """A finding about the robot's file alone, which forces contradict if it is more than a note."""
+    """A finding about the robot's file alone; not a note if forces contradict the file."""
     names = [robot.bodies[body.number].name for body in bodies]
     named = join_names([f"{name} has {body.fault}" for name, body in zip(names, bodies, strict=True)], _NAMED)
-    contradicted = "" if severity == NOTE else "forces contradict it, and "
-    advice = f"correct masses and inertias of these links in the {robot.format}: look for a lost decimal point"
-    text = f"{contradicted}the {robot.format} is implausible: {named}"
+    contradicted = "" if severity == NOTE else ", and forces contradict it"
+    advice = f"correct masses and inertias of these links in the {robot.format}; look for a lost decimal point"
+    text = f"the {robot.format} is implausible{contradicted}: {named}"
     return Finding("inertials", severity, "robot", text, advice, tuple(names))
 
 
 def _without(bodies: Sequence[ImplausibleBody], filtered: FilteredLog) -> FilteredLog:
-    """The log beside a robot of whose implausible bodies the file tells nothing."""
+    """The log with a robot whose implausible bodies have unknown parameters."""
     unknown = np.zeros(filtered.model.robot.nominal.shape, bool)
     for body in bodies:
         unknown[body.number, parameters.INERTIAL if body.of_mass else parameters.INERTIA] = True
@@ -317,13 +316,12 @@ def _without(bodies: Sequence[ImplausibleBody], filtered: FilteredLog) -> Filter
 def _contradiction(unexplained: float, model: NominalModel) -> Finding:
     """A finding about forces that no usual mistake explains."""
     form = model.robot.format
-    text = (
-        f"no {form} near the given one explains {format_percent(UNMODELLED_FORCE_SHARE * unexplained)} % of the forces"
-    )
-    advice = f"check units, frames, the order of joints and contacts, friction, the {form}'s base link and masses, and"
-    advice += f" whether the {form} is that of this robot"
+    share = format_percent(UNMODELLED_FORCE_SHARE * unexplained)
+    text = f"{share} % of the forces are unexplained, even with small changes of the {form}'s parameters"
+    advice = "check units, frames, friction, the order of joints and contacts,"
+    advice += f" the {form}'s base link and masses, and that the {form} describes this robot"
     if not model.contacts and not model.robot.fixed_base:
-        advice = f"name under contacts what touches the ground, or holds the base in the air; or {advice}"
+        advice = f"list under contacts what touches the ground or holds the base; or {advice}"
     return Finding("forces", SUSPICIOUS, "all", text + UNEXPLAINED, advice)
 
 
@@ -348,10 +346,10 @@ def _usual_mistake(filtered: FilteredLog, equations: ForceEquations, derived: tu
         return None
     left, best = trials[0]
     ratio = unexplained / max(left, 1e-9)
-    text = f"{best.description}: {ratio:.2g} times as much of the forces is unexplained as once corrected"
+    text = f"{best.description}: unexplained forces are {ratio:.2g} times as large as after correction"
     for other_left, other in trials[1:]:
         if other_left < _ALIKE_RATIO * left and other.description != best.description:
-            text += f"; or {other.field} {other.description}, which explains as much"
+            text += f". As likely: {other.field} {other.description}"
     finding = Finding("unit, sign or frame", REJECTED, best.field, text, best.advice)
     return Explanation([finding], left, 1, np.zeros(0))
 
@@ -369,7 +367,7 @@ def _corrected(mistake: Mistake, filtered: FilteredLog, equations: ForceEquation
 
 
 def _driving_friction(filtered: FilteredLog, equations: ForceEquations) -> Iterator[Finding]:
-    """Findings about joints of a bolted arm most of whose torque is friction that would drive them."""
+    """Findings about joints of a fixed-base arm with a torque that is mostly friction of the wrong sign."""
     robot = filtered.model.robot
     samples = equations.samples
     readings = equations.samples.torque
@@ -387,8 +385,8 @@ def _driving_friction(filtered: FilteredLog, equations: ForceEquations) -> Itera
         load = parts[:, 2:].sum(axis=1)
         others = np.linalg.norm(load) + np.linalg.norm(torque - friction - load)
         if friction @ velocity < 0.0 and np.linalg.norm(friction) > _MIN_FRICTION_RATIO * others:
-            text = f"{name}: reversed: most of the torque is friction, which would drive the joint"
-            advice = "reverse these torques; or positions and velocities, if these are"
+            text = f"{name}: the torque is reversed. It is mostly friction, which would drive the joint"
+            advice = "reverse these torques; or positions and velocities, if these are reversed"
             yield Finding("sign", REJECTED, "joint_torque", text, advice, (name,))
 
 
@@ -412,10 +410,9 @@ def _dead_encoders(filtered: FilteredLog, equations: ForceEquations) -> Iterator
         if joint < 0 or share[joint] < _MIN_DEAD_SHARE:
             continue
         unit = "N" if name in robot.sliding else "N m"
-        text = f"{name} stands still, with {error[joint]:.2g} {unit} rms that a joint at rest does not need"
+        text = f"{name} stands still with an unexplained load of {error[joint]:.2g} {unit} (rms)"
         held = error[joint] < MAX_FRICTION_SHARE * float(load.max())
-        advice = "none if friction or a brake holds it; else " * bool(held)
-        advice += "look whether it moves, for a dead encoder, and leave the log out"
+        advice = "nothing if friction or a brake holds it; else " * bool(held) + DEAD_ENCODER_ADVICE
         yield Finding("dead encoder", NOTE if held else SUSPICIOUS, "joint_position", text, advice, (name,))
 
 
@@ -482,7 +479,7 @@ def _time_scale(log: Log, model: NominalModel) -> Explanation | None:
     if abs(np.log(factor)) < np.log(MIN_TIME_FACTOR) or not agree.all() or ratio < _MIN_TIME_RATIO or not makes_up:
         return None
     units = [name for size, name in _TIME_UNITS.items() if abs(factor / size - 1.0) < 0.1]
-    text = f"gravity and inertia make up the measured forces if time is multiplied by {factor:.3g}"
-    advice = "give seconds; check the sample rate that the stamps were made from"
+    text = f"gravity and inertia explain the measured forces if time is multiplied by {factor:.3g}"
+    advice = "convert time to seconds; check the sample rate of the stamps"
     finding = Finding("unit", REJECTED, "time", f"in {units[0]}: {text}" if units else text, advice)
     return Explanation([finding], float(unexplained[best]), 1, np.array([factor]))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import join_names
-from torchid.log_checks.motion import MAX_ANGLE_RAD
+from torchid.log_checks.motion import INVERSE_QUATERNION, MAX_ANGLE_RAD, QUATERNION_ORDER
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, FloatArray
 from torchid.logs.quaternion import inverse_rotation, make_sign_continuous, rotate_to_base
@@ -39,7 +39,7 @@ _MOST_APART = 2
 def exchanged_names(names: Sequence[str], shortest: int = 2) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Possible true names of the columns, with a description: sides, ends, two limbs, or the order.
 
-    `shortest`: number of names that a limb has at least.
+    `shortest`: fewest names of a limb.
     """
     known = {tuple(names)}
     for description, pairs in zip(_ENDS_OF_ROBOTS, (_SIDES, _ENDS), strict=True):
@@ -49,8 +49,8 @@ def exchanged_names(names: Sequence[str], shortest: int = 2) -> Iterator[tuple[s
             yield description, permuted
     for description, permuted in (
         *_exchanged_pairs(names, shortest),
-        ("alphabetical order and this", tuple(sorted(names))),
-        ("the order", tuple(names[::-1])),
+        ("alphabetical and given order", tuple(sorted(names))),
+        ("the two ends of the order", tuple(names[::-1])),
     ):
         if permuted not in known and len(names) > 1:
             known.add(permuted)
@@ -68,9 +68,9 @@ def _exchanged(names: Sequence[str], pairs: Sequence[str]) -> tuple[str, ...] | 
 
 
 def _exchanged_pairs(names: Sequence[str], shortest: int) -> list[tuple[str, tuple[str, ...]]]:
-    """The names with two limbs exchanged, which differ in a word, or the first two: `lf_hip` and `rf_hip`.
+    """The names with two limbs exchanged; their names differ in one or two words, as `lf_hip` and `rf_hip`.
 
-    Of limbs with at least the `shortest` number of names; none of a robot with too many limbs to try all pairs.
+    Limbs have at least `shortest` names. Empty if there are too many pairs of limbs to try.
     """
     limbs: dict[tuple[int, int], dict[str, dict[tuple[str, str], str]]] = {}  # by place, limb, and what is beside it
     for name in names:
@@ -97,10 +97,10 @@ def _by_first_letter(names: Sequence[str]) -> tuple[str, ...] | None:
 
 
 def joint_orders(robot: Robot) -> dict[str, tuple[str, ...]]:
-    """Orders of a robot's joints that programs without names use, by description.
+    """Usual orders of a robot's joints in programs without joint names, by description.
 
-    Libraries for dynamics and MuJoCo go depth first, Isaac Lab breadth first; Isaac Gym, and what a USD file was made
-    with, take the limbs of a body by name, others as they are listed.
+    Dynamics libraries and MuJoCo go depth first, Isaac Lab breadth first. Isaac Gym and USD exporters sort limbs by
+    name, others keep the order of the file.
     """
     names = {number: body.joint.name for number, body in enumerate(robot.bodies) if body.joint is not None}
 
@@ -123,9 +123,9 @@ def joint_orders(robot: Robot) -> dict[str, tuple[str, ...]]:
 
 
 def other_orders(names: Sequence[str], robot: Robot | None) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Possible true names of the columns of joints, with a description, as of `exchanged_names`; `robot` if known.
+    """Possible true names of the joint columns, with a description: `exchanged_names` and orders of other programs.
 
-    Beside these, orders of other programs, with left and right, or front and rear, exchanged, too.
+    Orders of other programs need the `robot`, and come also with left and right, or front and rear, exchanged.
     """
     known = {tuple(names)}
     for description, permuted in exchanged_names(names):
@@ -142,20 +142,20 @@ def other_orders(names: Sequence[str], robot: Robot | None) -> Iterator[tuple[st
 
 
 def exchanged_pairs(names: Sequence[str], some: Collection[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """The names with any two exchanged, one of them at least among `some`."""
+    """The names with any two exchanged, at least one of them in `some`."""
     for one, other in itertools.combinations(names, 2):
         if one in some or other in some:
             yield _with_exchanged(names, one, other)
 
 
 def _with_exchanged(names: Sequence[str], one: str, other: str) -> tuple[str, tuple[str, ...]]:
-    """The names with two exchanged, and what is."""
+    """A description, and the names with two exchanged."""
     partner = {one: other, other: one}
     return f"{one} and {other} exchanged", tuple(partner.get(name, name) for name in names)
 
 
 def exchanged_in_limbs(names: Sequence[str], robot: Robot | None) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """The names with two joints of a limb exchanged that are neighbours, or have one joint between."""
+    """The names with two joints of a limb exchanged: neighbours, or with one joint between them."""
     if robot is None or set(names) != set(robot.joint_names):
         return
     for body in robot.bodies:
@@ -198,8 +198,8 @@ _MILLI_MOMENT_FACTORS = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
 class Mistake:
     """A common mistake: its field, a description, advice, and the function that corrects a log.
 
-    `after_filter`: a filtered log is corrected alike, by other names or by a constant linear map of what was filtered.
-    `of_joint`: of how a single joint is counted, which its friction can contradict.
+    `after_filter`: `correct` also works on a filtered log (new names, or a constant linear map of filtered values).
+    `of_joint`: it concerns the sign or zero of one joint; the joint's friction can contradict it.
     """
 
     field: str
@@ -211,12 +211,12 @@ class Mistake:
 
 
 def possible_mistakes(log: Log, robot: Robot | None = None) -> Iterator[Mistake]:
-    """The mistakes that this log may contain; orders of joints of other programs if the robot is known."""
+    """The mistakes that this log may contain; joint orders of other programs need the robot."""
     for rates in (_JOINT_RATES, _BASE_RATES):
         given = [field for field in rates if getattr(log, field) is not None]
         if given:
             text = f"{' and '.join(given)} not the derivatives of the positions"
-            yield Mistake(given[-1], text, "leave them out: they are derived then", _remove(given))
+            yield Mistake(given[-1], text, "remove them: torchid then derives them", _remove(given))
     yield Mistake(
         "joint_position", "in degrees", "convert to radians", lambda log: _degrees_to_radians(log, slice(None))
     )
@@ -227,19 +227,14 @@ def possible_mistakes(log: Log, robot: Robot | None = None) -> Iterator[Mistake]
     yield from _order_mistakes(log, robot)
     yield from _orientation_mistakes() if log.base_quat_xyzw is not None else _mountings()
     if log.imu_specific_force is not None:
-        reading = "reversed: gravity minus acceleration"
-        yield Mistake(
-            "imu_specific_force",
-            reading,
-            "reverse it: it points up at rest",
-            _multiply("imu_specific_force", -1.0),
-            True,
-        )
+        advice = "reverse it: it must point up at rest"
+        reverse = _multiply("imu_specific_force", -1.0)
+        yield Mistake("imu_specific_force", "reversed (gravity minus acceleration)", advice, reverse, True)
         yield from accelerometer_axes(log, robot)
     if log.joint_torque is not None:
         for description, permuted in other_orders(log.joint_names, robot):  # of limbs, or of drives
             order = [permuted.index(name) for name in log.joint_names]
-            advice = "give torques in the order of joint_names, as positions"
+            advice = "give torques in the order of joint_names"
             yield Mistake("joint_torque", description, advice, _reorder(("joint_torque",), order), True)
     if log.base_position_world is not None:
         yield from _unit_mistakes("base_position_world", "length")
@@ -249,7 +244,7 @@ def possible_mistakes(log: Log, robot: Robot | None = None) -> Iterator[Mistake]
 
 
 def accelerometer_axes(log: Log, robot: Robot | None) -> Iterator[Mistake]:
-    """An accelerometer on the base whose readings were turned to the world's axes."""
+    """Readings of an accelerometer on the base, given along the world's axes."""
     if log.imu_specific_force is None or log.base_quat_xyzw is None or robot is None:
         return
     body, T_base_imu = robot.links.get(log.imu_frame, (1, np.eye(4)))
@@ -259,45 +254,43 @@ def accelerometer_axes(log: Log, robot: Robot | None) -> Iterator[Mistake]:
         return {"imu_specific_force": in_base @ T_base_imu[:3, :3]}
 
     if body == 0:
-        advice = "give the reading of the accelerometer, along the axes of imu_frame"
+        advice = "give the reading of the accelerometer along the axes of imu_frame"
         yield Mistake("imu_specific_force", "along the world's axes", advice, _change(along_imu))
 
 
 def _orientation_mistakes() -> Iterator[Mistake]:
-    """Other worlds and orders than those of a quaternion xyzw from base to a world whose z axis points up."""
-    up = "turn positions, orientations and vectors so that z points up"
+    """Orientations in other worlds, or in other conventions than xyzw from base to a world with z up."""
+    up = "rotate positions, orientations and vectors so that z points up"
     for axis_points, quarters in _WORLDS.items():
         turned_up = _turn_world(Rotation.from_rotvec(0.5 * np.pi * np.array(quarters)))
         yield Mistake("base_quat_xyzw", f"in a world whose {axis_points}", up, turned_up)
-    order = "w first against w last is mixed up"
-    rename = "rename base_quat_wxyz and base_quat_xyzw"
-    yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, -1, axis=1)))
-    yield Mistake("base_quat_xyzw", order, rename, _with_quaternions(lambda quat: np.roll(quat, 1, axis=1)))
-    yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _with_quaternions(inverse_rotation))
-    downward = "of a base whose z axis points down"  # feet that stand cannot tell whether the world's does, too
-    forward = "turn the base's axes to x forward, y left, z up, and the world's where its z axis points down, too (PX4)"
+    yield Mistake("base_quat_xyzw", *QUATERNION_ORDER, _with_quaternions(lambda quat: np.roll(quat, -1, axis=1)))
+    yield Mistake("base_quat_xyzw", *QUATERNION_ORDER, _with_quaternions(lambda quat: np.roll(quat, 1, axis=1)))
+    yield Mistake("base_quat_xyzw", *INVERSE_QUATERNION, _with_quaternions(inverse_rotation))
+    downward = "of a base whose z axis points down"  # standing feet cannot tell whether the world's z axis does, too
+    forward = "rotate the base to x forward, y left, z up; rotate the world too if its z axis points down (PX4)"
     turn_world = _turn_world(Rotation.from_rotvec([np.pi, 0.0, 0.0]))
     yield Mistake("base_quat_xyzw", downward, forward, _turn_base)
     yield Mistake("base_quat_xyzw", downward, forward, lambda log: _turn_base(turn_world(log)))
     for axis, name in enumerate("xyz"):
-        mirrored = f"in a left-handed world, whose {name} axis is reversed"
-        turn = "give a right-handed world's"
-        yield Mistake("base_quat_xyzw", mirrored, f"{turn} orientations and vectors", _mirror_world(axis))
+        mirrored = f"in a left-handed world: its {name} axis is reversed"
+        turn = "convert orientations and vectors to a right-handed world"
+        yield Mistake("base_quat_xyzw", mirrored, turn, _mirror_world(axis))
 
 
 def _mountings() -> Iterator[Mistake]:
-    """Bases on a ceiling or a wall, and not upright, which a fixed base is taken for whose log has no orientation."""
+    """Fixed bases on a ceiling or a wall; without an orientation in the log they are assumed upright."""
     for place, *turns in (("ceiling", (2, 0)), ("wall", (1, 0), (-1, 0), (0, 1), (0, -1))):
         for x, y in 0.5 * np.pi * np.array(turns):
             quat = np.array([np.sin(0.5 * x), np.sin(0.5 * y), 0.0, np.cos(0.5 * x) * np.cos(0.5 * y)])
-            advice = f"robot.base_tilt: [{x:.4f}, {y:.4f}] about the base link's x and y axes"
+            advice = f"set robot.base_tilt: [{x:.4f}, {y:.4f}] (about the base link's x and y axes)"
             yield Mistake("base", f"mounted on a {place}", advice, _constant("base_quat_xyzw", quat))
 
 
 def reversed_joints(log: Log) -> Iterator[Mistake]:
     """Joints whose position is reversed, one at a time: many logs to try."""
     for joint, name in enumerate(log.joint_names):
-        advice = f"logs.columns.joint_position.scale: {{{name}: -1}}, of velocity and torque too if they count likewise"
+        advice = f"set logs.columns.joint_position.scale: {{{name}: -1}}; for velocity and torque, too, if reversed"
         yield Mistake("joint_position", f"{name} reversed", advice, _reverse_joint(joint))
 
 
@@ -315,12 +308,13 @@ def joint_mistakes(log: Log) -> Iterator[Mistake]:
     if len(log.joint_names) > _MAX_SINGLE_JOINTS:
         return
     for joint, name in enumerate(log.joint_names):
-        flip = f"logs.columns: scale {{{name}: -1}} of joint_position, and of velocity and acceleration"
+        flip = f"set logs.columns.joint_position.scale: {{{name}: -1}}; for velocity and acceleration, too"
         both = (*_JOINT_MOTION, "joint_torque")
         yield Mistake("joint_position", f"{name} reversed", flip, _flip_joint(joint, _JOINT_MOTION), True, True)
-        yield Mistake("joint_position", f"{name} reversed, with its torque", flip, _flip_joint(joint, both), True, True)
+        text = f"{name} reversed, with its torque"
+        yield Mistake("joint_position", text, f"{flip}, and for torque", _flip_joint(joint, both), True, True)
         for degrees in (90, -90, 180):
-            text = f"{name} read from another zero"
+            text = f"{name} has another zero"
             advice = f"add {degrees} degrees to its positions"
             yield Mistake("joint_position", text, advice, _shift_joint(joint, np.radians(degrees)), True, True)
 
@@ -345,14 +339,14 @@ def _shift_joint(joint: int, angle: float) -> Callable[[Log], Log]:
 
 
 def exchanged_joints(names: Sequence[str], some: Collection[str]) -> Iterator[Mistake]:
-    """Names of any two joints, one of them at least among `some`, exchanged: many logs to try."""
+    """Names of any two joints exchanged, at least one of them in `some`: many logs to try."""
     for text, permuted in exchanged_pairs(names, some):
         yield _misnamed_joints(text, permuted)
 
 
 def _misnamed_joints(text: str, permuted: tuple[str, ...]) -> Mistake:
-    """A mistake of joints whose columns are those of `permuted`."""
-    advice = "give joint_names in the order of the columns; of arrays without names logs.columns.joint_order: "
+    """Wrong joint names: the true names of the columns are `permuted`."""
+    advice = "give joint_names in the order of the columns; for arrays without names set logs.columns.joint_order: "
     advice += f"[{', '.join(permuted)}]"
     return Mistake("joint_names", text, advice, _rename("joint_names", permuted), True)
 
@@ -372,12 +366,12 @@ def _order_mistakes(log: Log, robot: Robot | None) -> Iterator[Mistake]:
 
 def _unit_mistakes(field: str, quantity: str, after_filter: bool = False) -> Iterator[Mistake]:
     for units, factor in other_units(quantity).items():
-        advice = f"{advise_units({field: tuple(units.split(' or '))})}; without a map multiply by {factor:.4g}"
+        advice = f"{advise_units({field: tuple(units.split(' or '))})}, or multiply by {factor:.4g}"
         yield Mistake(field, f"in {units}", advice, _multiply(field, factor), after_filter)
 
 
 def quarter_turns() -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Sensors mounted in other right angles: how to get the frame's components, and the matrix (3, 3) that does."""
+    """Mountings of a sensor rotated by right angles: the frame's components in words, and their matrix (3, 3)."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             R = np.diag(signs) @ np.eye(3)[list(order)]
@@ -395,16 +389,16 @@ def _wrench_mistakes(field: str, other: str) -> Iterator[Mistake]:
     moments = _change(lambda log: {field: getattr(log, field) * _MILLI_MOMENT_FACTORS})
     yield Mistake(field, "moments in N mm", "multiply moments by 0.001", moments, True)
     opposite = _change(lambda log: {field: getattr(log, field) * _OPPOSITE_MOMENTS})
-    yield Mistake(field, "moments reversed", "reverse the moments: those that the ground exerts", opposite, True)
+    yield Mistake(field, "moments reversed", "reverse the moments: give what the ground exerts", opposite, True)
     first = _change(lambda log: {field: np.roll(getattr(log, field), 3, axis=2)})
     yield Mistake(field, "with the moment first", "give the force first, then the moment", first, True)
     axes = "along the world's axes" if other == WRENCHES[1] else "along the contact frames' axes"
     moved = _change(lambda log: {other: getattr(log, field), field: None, "moments_about_world_origin": False})
-    yield Mistake(field, axes, f"call it {other}", moved, True)
+    yield Mistake(field, axes, f"rename it to {other}", moved, True)
     if field == WRENCHES[0]:
         for axes, R in quarter_turns():
-            turn = f"turn forces and moments into the contact frames, whose {axes}"
-            yield Mistake(field, "along axes turned by right angles", turn, _turn_wrench(field, R), True)
+            turn = f"rotate forces and moments into the contact frames: their {axes}"
+            yield Mistake(field, "along axes rotated by right angles", turn, _turn_wrench(field, R), True)
 
 
 def _turn_world(turn: Rotation) -> Callable[[Log], Log]:
@@ -426,13 +420,13 @@ def _turn_world(turn: Rotation) -> Callable[[Log], Log]:
 
 
 def _turn_base(log: Log) -> Log:
-    """A log whose orientation is that of axes half a turn about x from the base's."""
+    """A log with base axes rotated by half a turn about x."""
     half_turn = Rotation.from_rotvec([np.pi, 0.0, 0.0])
     return _with_quaternions(lambda quat: (Rotation.from_quat(quat) * half_turn).as_quat())(log)
 
 
 def _mirror_world(axis: int) -> Callable[[Log], Log]:
-    """A log in a world, and along axes of the base, of which one is reversed: two components of the quaternion are."""
+    """A log with one axis of the world and of the base reversed; this reverses two components of the quaternion."""
     signs = np.ones(3)
     signs[axis] = -1.0
 

@@ -35,13 +35,18 @@ from torchid.rounding import STD_PER_MAD
 MAX_ANGLE_RAD = 4.0 * np.pi
 #: Median speed of the joints: motors of legs reach 20 to 30 rad/s.
 MAX_SPEED_RAD_S = 40.0
-_UNIT_ADVICE = "convert joint_position, and velocities and accelerations with it, to radians"
+_UNIT_ADVICE = "convert joint_position, joint_velocity and joint_acceleration to radians"
+DEAD_ENCODER_ADVICE = "check whether the joint moves; if it does, its encoder is dead: do not use this log"
+#: Descriptions of mistakes, and what to do.
+QUATERNION_ORDER = "wrong order: w first and w last are confused", "rename base_quat_wxyz and base_quat_xyzw"
+INVERSE_QUATERNION = "rotates world to base, not base to world", "give the inverse"
+_DERIVE_ADVICE = "remove the field: torchid then derives it"
 
 
 def check_angle_unit(log: Log, robot: Robot | None) -> Iterator[Finding]:
     """Findings about the unit of `joint_position`.
 
-    Continuous joints, as of wheels, may turn as far as they like, and count where most others do.
+    Continuous joints, such as wheels, may turn any number of times. They count only if most other joints do, too.
     """
     bodies = () if robot is None else robot.bodies
     joints = {body.joint.name: body.joint for body in bodies if body.joint is not None}
@@ -56,14 +61,14 @@ def check_angle_unit(log: Log, robot: Robot | None) -> Iterator[Finding]:
         far &= has_stops
     names = [log.joint_names[columns[i]] for i in np.flatnonzero(far)]
     if far.any():
-        text = f"{join_names(names)}: up to {np.abs(position[:, far]).max():.4g}, more than two turns: degrees?"
+        text = f"{join_names(names)}: up to {np.abs(position[:, far]).max():.4g} rad, more than two turns. In degrees?"
         certain = 0 < int((moved & has_stops).sum()) <= 2 * int((far & has_stops).sum())
         severity = REJECTED if certain else SUSPICIOUS
         yield Finding("unit", severity, "joint_position", text, _UNIT_ADVICE, tuple(names))
     elif len(log) > 2:
         speed = np.percentile(np.abs(np.diff(position, axis=0)) / np.diff(log.time)[:, None], 90.0, axis=0)
         if float(np.median(speed)) > MAX_SPEED_RAD_S:
-            text = f"half of the joints faster than {np.median(speed):.3g} rad/s: degrees, or time in another unit?"
+            text = f"half of the joints exceed {np.median(speed):.3g} rad/s. Are angles in degrees, or time in ms?"
             yield Finding("unit", SUSPICIOUS, "joint_position", text, _UNIT_ADVICE)
 
 
@@ -172,7 +177,7 @@ _DERIVATIVE_CHECK = "velocities and accelerations against positions"
 def check_derivatives(log: Log) -> Iterator[Finding | Skipped]:
     """Findings about recorded velocities and accelerations."""
     if not any(getattr(log, name) is not None for chain in DERIVATIVE_CHAINS for name in chain[1:]):
-        yield Skipped(_DERIVATIVE_CHECK, "the log gives neither velocities nor accelerations")
+        yield Skipped(_DERIVATIVE_CHECK, "the log has neither velocities nor accelerations")
     for chain in DERIVATIVE_CHAINS:
         given = [(order, name) for order, name in enumerate(chain) if getattr(log, name) is not None]
         for (low, base), (high, name) in zip(given, given[1:], strict=False):
@@ -206,38 +211,33 @@ def _derivative_findings(
     if off.any():
         worst = int(np.argmax(np.abs(np.log(np.where(off, np.abs(comparison.ratio), 1.0) + _TINY))))
         text = f"{comparison.ratio[worst]:.3g} times the derivative of {base} ({channels[worst]})"
-        yield _finding("ratio", SUSPICIOUS, name, channels, off, text, "leave the field out: it is derived then")
+        yield _finding("ratio", SUSPICIOUS, name, channels, off, text, _DERIVE_ADVICE)
     late = follows & (np.abs(comparison.delay) >= MIN_DELAY_SAMPLES)
     if late.any():
         typical = float(np.median(comparison.delay[late]))
         text = f"{'lags' if typical > 0 else 'leads'} the derivative of {base} by {abs(typical):.3g} samples"
-        yield _finding("delay", SUSPICIOUS, name, channels, late, text, "leave the field out: it is derived then")
+        yield _finding("delay", SUSPICIOUS, name, channels, late, text, _DERIVE_ADVICE)
     if lost.any():
-        text = (
-            f"does not follow {base}: correlation {np.nanmin(np.abs(comparison.correlation)):.2f} with its derivative"
-        )
-        cause = "the order of its joints" if name.startswith("joint") else "its frame"
-        advice = f"leave the field out: it is derived then; or look for {cause}"
+        text = f"does not follow the derivative of {base} (correlation {np.nanmin(np.abs(comparison.correlation)):.2f})"
+        advice = f"check the {'order of its joints' if name.startswith('joint') else 'frame'}, or {_DERIVE_ADVICE}"
         yield _finding("derivative", SUSPICIOUS, name, channels, lost, text, advice)
 
 
 def _meaning(ratio: float, name: str, base: str, order: int | None) -> tuple[str, str] | None:
-    """Cause of a ratio of a derivative, and what to do; None where none is known. `order`: None if time is no cause."""
+    """Cause of a derivative's ratio, and what to do; None if unknown. `order`: None if time cannot be the cause."""
     if abs(ratio + 1.0) < UNIT_TOLERANCE:
-        return "the sign is reversed", "convert it, or leave the field out"
+        return "the sign is reversed", "reverse it, or remove the field"
     units = units_of_derivative_ratio(ratio, name, base, order)
     if not units:
         return None
-    return describe_units(units), f"{advise_units(units)}; without a map convert it, or leave the field out"
+    return describe_units(units), f"{advise_units(units)}, or convert or remove the field"
 
 
 def _frame_findings(log: Log, name: str, base: str, order: int, comparison: DerivativeComparison) -> Iterator[Finding]:
     """Findings about a vector of the base that is in the other frame, or that contains gravity."""
     if name == "base_linear_acceleration_world" and abs(abs(comparison.excess[2] / GRAVITY) - 1.0) < UNIT_TOLERANCE:
-        text = (
-            f"{comparison.excess[2]:+.2f} m/s^2 along z on average beyond the derivative of {base}: it contains gravity"
-        )
-        advice = "give d/dt of the velocity, or name it imu_specific_force"
+        text = f"exceeds the derivative of {base} by {comparison.excess[2]:.2f} m/s^2 along z: it contains gravity"
+        advice = "give the derivative of the velocity, or rename it to imu_specific_force"
         yield Finding("gravity", REJECTED, name, text, advice, ("z",))
     if not name.startswith("base_linear") or log.base_quat_xyzw is None or comparison.misfit < MAX_MISFIT:
         return
@@ -245,8 +245,8 @@ def _frame_findings(log: Log, name: str, base: str, order: int, comparison: Deri
         rotated = rotate(log.base_quat_xyzw, getattr(log, name))
         trial = compare_derivative(log.time, getattr(log, base), rotated, order)
         if trial is not None and trial.misfit < MAX_DERIVATIVE_RESIDUAL_SHARE * comparison.misfit:
-            text = f"follows {base} if it is in the {actual} frame, not in the frame of its name"
-            yield Finding("frame", REJECTED, name, text, f"call it {name.replace('world', actual)}")
+            text = f"fits {base} in the {actual} frame, not in the frame of its name"
+            yield Finding("frame", REJECTED, name, text, f"rename it to {name.replace('world', actual)}")
 
 
 def _finding(
@@ -271,7 +271,7 @@ def check_angular_velocity(log: Log, robot: Robot | None) -> Iterator[Finding | 
         return
     recorded = dict(_recorded_velocities(log, robot))
     if not recorded:
-        unknown = "an IMU, and no robot with its frame"
+        unknown = "the IMU needs a robot with imu_frame"
         yield Skipped(_ANGULAR_VELOCITY_CHECK, unknown if log.imu_frame else "no angular velocity of the base")
     for field, omega in recorded.items():
         comparison = compare_derivative(log.time, _integrate(log.time, _omega(log.time, quat)), omega)
@@ -317,24 +317,21 @@ class _Mistake:
 def _mistakes(quat: FloatArray, omega: FloatArray) -> Iterator[_Mistake]:
     """Common mistakes with an orientation (N, 4) and an angular velocity (N, 3)."""
     frame = "fits in the {} frame, not in the {} frame"
-    yield _Mistake(frame.format("world", "base"), "call it ..._world", "", quat, rotate_to_base(quat, omega))
-    yield _Mistake(frame.format("base", "world"), "call it ..._base", "", quat, rotate_to_world(quat, omega))
-    order = "the order of the components is mistaken: w first against w last"
-    rename = "rename base_quat_wxyz and base_quat_xyzw"
+    yield _Mistake(frame.format("world", "base"), "rename it to ..._world", "", quat, rotate_to_base(quat, omega))
+    yield _Mistake(frame.format("base", "world"), "rename it to ..._base", "", quat, rotate_to_world(quat, omega))
     for shift in (1, -1):
         rolled = make_sign_continuous(np.roll(quat, shift, axis=1))
-        yield _Mistake(order, rename, "base_quat_xyzw", rolled, omega)
+        yield _Mistake(*QUATERNION_ORDER, "base_quat_xyzw", rolled, omega)
         from_world = rotate_to_base(rolled, rotate_to_world(quat, omega))  # if the log gave it in the world frame
-        yield _Mistake(order, rename, "base_quat_xyzw", rolled, from_world)
+        yield _Mistake(*QUATERNION_ORDER, "base_quat_xyzw", rolled, from_world)
     yield _Mistake("the sign is reversed", "reverse it", "", quat, -omega)
-    name = "rotates world to base, not base to world"
-    yield _Mistake(name, "give the inverse", "base_quat_xyzw", inverse_rotation(quat), omega)
+    yield _Mistake(*INVERSE_QUATERNION, "base_quat_xyzw", inverse_rotation(quat), omega)
 
 
 def _best_mistake(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: float) -> _Mistake | None:
-    """The mistake whose correction leaves the least misfit, if that is small enough.
+    """The mistake whose correction has the smallest misfit, if that is small enough.
 
-    Several may explain it: the inverse and the reversed orientation are nearly equal for a base that turns little.
+    Several may do: the inverse and the reversed orientation are nearly equal for a base that turns little.
     """
     best = None
     least = MAX_DERIVATIVE_RESIDUAL_SHARE * misfit
@@ -347,7 +344,7 @@ def _best_mistake(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit:
 
 
 def _mounted_otherwise(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: float) -> _Mistake | None:
-    """An angular velocity along the axes of another frame, which is found; None if that does not explain the misfit."""
+    """An angular velocity along the axes of another frame; None if no rotation explains the misfit."""
     lag = max(2, round(LAG_S / float(np.median(np.diff(time)))))
     true, read = (_differences(_integrate(time, x), lag, 1) for x in (_omega(time, quat), omega))
     turn = Rotation.align_vectors(true - true.mean(axis=0), read - read.mean(axis=0))[0]
@@ -356,12 +353,12 @@ def _mounted_otherwise(time: FloatArray, quat: FloatArray, omega: FloatArray, mi
     if trial is None or trial.misfit > MAX_DERIVATIVE_RESIDUAL_SHARE * misfit:
         return None
     degrees = ", ".join(f"{x:.0f}" for x in turn.as_rotvec(degrees=True))
-    text = f"fits the orientation if it is turned by ({degrees}) degrees about the base's axes"
-    return _Mistake(text, "imu_frame is the frame of the URDF along whose axes the IMU reads", "", quat, turned)
+    text = f"fits the orientation if turned by ({degrees}) degrees about the base's axes"
+    return _Mistake(text, "set imu_frame to the robot's frame with the axes of the IMU", "", quat, turned)
 
 
 def completed(log: Log, robot: Robot | None) -> tuple[Log, list[Finding]]:
-    """The log with joints of loops that follow from the others, see `with_loop_joints`; or the log, and why not."""
+    """The log with the dependent joints of loops, see `with_loop_joints`; or the log as it is, and a finding."""
     try:
         return with_loop_joints(log, robot), []
     except LogError as error:
@@ -370,18 +367,18 @@ def completed(log: Log, robot: Robot | None) -> tuple[Log, list[Finding]]:
 
 
 def check_loops(log: Log, robot: Robot | None) -> Iterator[Finding]:
-    """A finding for each loop, at the joint positions of the log; none where it lacks joints of the robot."""
+    """A finding for each loop; none if the log lacks joints of the robot."""
     if robot is None or not robot.loops or not set(robot.joint_names) <= set(log.joint_names):
         return
     order = [log.joint_names.index(name) for name in robot.joint_names]
     for gap in loop_gaps(robot, torch.from_numpy(log.joint_position[:, order])):
         if gap.is_open:
-            advice = f"look for other frames, zeros of encoders or signs; accepted is {gap.accepted}"
-            text = f"{gap.loop.label} are apart by {gap}"
+            advice = f"check the loop's frames, encoder zeros and signs; accepted: {gap.accepted}"
+            text = f"{gap.loop.label} do not meet: {gap}"
             yield Finding("open loop", REJECTED, "joint_position", text, advice, gap.loop.frames)
         else:
-            text = f"{gap.loop.label} are together up to {gap}"
-            yield Finding("closed loop", NOTE, "joint_position", text, f"nothing: accepted is {gap.accepted}")
+            text = f"{gap.loop.label} meet: {gap}"
+            yield Finding("closed loop", NOTE, "joint_position", text, f"nothing; accepted: {gap.accepted}")
 
 
 # ------------------------------------------------------------------------------------------------------ poses and rest
@@ -397,7 +394,7 @@ def recorded_link_poses(log: Log, robot: Robot) -> LinkPoses:
 
 
 def same_poses(log: Log, other: Log, robot: Robot, links: Sequence[str]) -> bool:
-    """Whether some links have the same poses in the base in two logs: joints beside or beyond them do not count."""
+    """Whether some links have the same poses in the base in two logs; other joints do not count."""
     if log.joint_position is other.joint_position and log.joint_names == other.joint_names:
         return True
     moved = {body - 1 for link in links if link in robot.links for body in robot.bodies_to(robot.links[link][0])}
@@ -434,7 +431,7 @@ def still_joints(log: Log) -> tuple[str, ...]:
 
 
 def check_still_velocities(log: Log) -> Iterator[Finding]:
-    """A finding about joints whose velocities move them while their positions stand still."""
+    """A finding about joints with constant positions whose velocities show a motion."""
     names = still_joints(log)
     velocity = log.joint_velocity
     if not names or velocity is None:
@@ -448,9 +445,8 @@ def check_still_velocities(log: Log) -> Iterator[Finding]:
     dead = [name for name in names if size[(j := log.joint_names.index(name))] > max(least[j], 1e-9)]
     if dead:
         ranges = [f"{name} {np.ptp(travelled[:, log.joint_names.index(name)]):.2g}" for name in dead]
-        text = f"positions stand still while velocities move these joints by (rad, slides: m) {join_names(ranges)}"
-        advice = "look whether these joints move, for a dead encoder, and leave the log out"
-        yield Finding("dead encoder", SUSPICIOUS, "joint_position", text, advice, tuple(dead))
+        text = f"positions are constant, but velocities move these joints (rad or m): {join_names(ranges)}"
+        yield Finding("dead encoder", SUSPICIOUS, "joint_position", text, DEAD_ENCODER_ADVICE, tuple(dead))
 
 
 def joints_of_limb(robot: Robot, frame: str) -> list[str]:

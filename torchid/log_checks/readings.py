@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import format_count, format_percent, join_names
 from torchid.log_checks.findings import (
+    EXCLUDE_ADVICE,
     MIN_GAP_STEPS,
     NEIGHBOUR_STEPS,
     NON_SIGNAL_FIELDS,
@@ -56,16 +57,15 @@ def check_magnitudes(log: Log) -> Iterator[Finding]:
         names = channel_names(log, field)
         columns = np.flatnonzero(bad.any(axis=0))
         channels = tuple(names[column] for column in columns)
-        text = (
-            f"{join_names(channels)}: beyond {MAX_MAGNITUDE:g}, in {format_count(int(bad.any(axis=1).sum()), 'sample')}"
-        )
+        samples = format_count(int(bad.any(axis=1).sum()), "sample")
+        text = f"{join_names(channels)}: larger than {MAX_MAGNITUDE:g} in {samples}"
         rare = bad.any(axis=1).mean() <= MAX_MISSING_SHARE
         spans = tuple(span for column in columns for span in find_spans(bad[:, column], names[column])) if rare else ()
         yield Finding("absurd", REJECTED, field, text, "look for uninitialised memory or an overflow", channels, spans)
 
 
 def check_missing_values(log: Log) -> Iterator[Finding]:
-    """Findings about NaN, in readings of contacts while they touch. Motion must be known throughout, not forces."""
+    """Findings about NaN, in readings of contacts during contact. Motion must be known in all samples, forces not."""
     for field in log.arrays():
         if field not in NON_SIGNAL_FIELDS:
             yield from _missing_findings(log, field)
@@ -95,18 +95,18 @@ def _missing_findings(log: Log, field: str) -> Iterator[Finding]:
         shares = ", ".join(f"{name} {format_percent(share)} %" for name, (_, share) in list(holes.items())[:4])
         text = f"NaN in {format_count(len(holes), 'channel')}, {format_count(len(spans), 'time')}: {shares}"
         if field in NAN_ALLOWED:
-            advice = "leave these samples out (exclude_rejected); a filter would lose the channels throughout"
+            advice = f"{EXCLUDE_ADVICE}; else a filter loses these channels in the whole log"
         else:
-            advice = "leave these samples out (exclude_rejected): motion must be known throughout"
+            advice = f"{EXCLUDE_ADVICE}: motion must be known in all samples"
         yield Finding("not measured", REJECTED, field, text, advice, tuple(holes), spans)
     if gone:
         entire = all(share == 1.0 for _, share in gone.values())
-        extent = "throughout" if entire else f"in {100 * max(share for _, share in gone.values()):.3g} % at most"
+        extent = "in all samples" if entire else f"in up to {100 * max(share for _, share in gone.values()):.3g} %"
         needed = field not in NAN_ALLOWED
         if needed:
-            advice = "record it throughout, or leave the field out if other fields give this motion"
+            advice = "record it in all samples, or remove the field if other fields give this motion"
         else:
-            advice = "none, unless it is one of the sensors" if entire else "leave it out of the sensors"
+            advice = "nothing, unless it is listed in sensors" if entire else "remove it from sensors"
         severity = REJECTED if needed else NOTE
         yield Finding("not measured", severity, field, f"{join_names(list(gone))}: NaN {extent}", advice, tuple(gone))
 
@@ -149,24 +149,25 @@ def check_time_stamps(log: Log) -> Iterator[Finding]:
     if short.any():
         numbers = np.flatnonzero(short)
         first = int(numbers[0])
-        below = f"{format_count(len(numbers), 'step')} below {SHORTEST_STEP:g} of the median"
-        text = f"{below}, the first of {steps[first]:.3g} s after sample {first}: noise is amplified there"
+        text = f"{format_count(len(numbers), 'step')} below {SHORTEST_STEP:g} of the median amplify noise;"
+        text += f" the first, after sample {first}, is {steps[first]:.3g} s"
         spans = tuple(Span(int(i) + 1, int(i) + 1) for i in numbers)
         yield Finding("coincident stamps", REJECTED, "time", text, "drop one sample of each pair", spans=spans)
 
 
 def _unit_finding(median: float) -> Finding:
     likely = [unit for unit, ticks in _TICKS_PER_S.items() if median / ticks <= MAX_MEDIAN_STEP_S]
-    guess = f"; are these {likely[0]}? Then {_TICKS_PER_S[likely[0]] / median:.4g} Hz" if likely else ""
-    return Finding("unit", REJECTED, "time", f"median step {median:.4g} s{guess}", "convert the stamps to seconds")
+    guess = f". In {likely[0]} the rate would be {_TICKS_PER_S[likely[0]] / median:.4g} Hz" if likely else ""
+    text = f"the median step is {median:.4g} s{guess}"
+    return Finding("unit", REJECTED, "time", text, "convert the stamps to seconds")
 
 
 def _jitter_finding(log: Log, steps: FloatArray, rms: float, largest: float, long: BoolArray) -> Finding:
-    text = f"rms {format_percent(rms)} % of the median step, at most {format_percent(largest)} %"
-    advice = "none: a filter (preprocessing.cutoff_hz) interpolates to a uniform grid"
+    text = f"steps vary by {format_percent(rms)} % (rms) of the median step, at most {format_percent(largest)} %"
+    advice = "nothing: the filter (preprocessing.cutoff_hz) resamples to a uniform grid"
     if _is_uniformly_sampled(log, steps, _MIN_DEVIATION_RMS * rms, long):
-        text += "; the positions do not follow: the stamps jitter, not the sampling"
-        advice = "replace the stamps by uniform ones, at the median rate"
+        text += ". Positions do not show it: the stamps jitter, not the sampling"
+        advice = "replace the stamps by uniform ones at the median rate"
     return Finding("jitter", NOTE, "time", text, advice)
 
 
@@ -190,11 +191,11 @@ def _gap_finding(steps: FloatArray, median: float, long: BoolArray) -> Finding:
     longest = int(np.argmax(steps))
     lost = int(np.round(steps[numbers] / median - 1.0).sum())
     missing = f"{format_count(len(numbers), 'gap')}, {format_count(lost, 'sample')} missing"
-    text = f"{missing}; longest {steps[longest]:.4g} s after sample {longest}"
+    text = f"{missing}; the longest gap is {steps[longest]:.4g} s, after sample {longest}"
     if steps[longest] > LONGEST_STEP * median:
-        advice = f"split the log after sample {longest}: no spline crosses more than {LONGEST_STEP:g} steps"
+        advice = f"split the log after sample {longest}: gaps above {LONGEST_STEP:g} steps are not interpolated"
         return Finding("gap", REJECTED, "time", text, advice)
-    advice = f"keep preprocessing.cutoff_hz well below {0.5 / steps[longest]:.3g}: half a period fits in the gap then"
+    advice = f"keep preprocessing.cutoff_hz well below {0.5 / steps[longest]:.3g}, where half a period fits in the gap"
     return Finding("gap", SUSPICIOUS, "time", text, advice, spans=tuple(Span(int(i), int(i) + 1) for i in numbers))
 
 
@@ -302,7 +303,7 @@ def check_repeats(groups: Iterable[ChannelGroup]) -> Iterator[Finding]:
 
 
 def _at_rest(group: ChannelGroup, steps: FloatArray, positions: ChannelGroup | None) -> BoolArray:
-    """Which steps (M - 1, c) of joint velocities or accelerations are those of a joint that does not move."""
+    """Mask (M - 1, c) of the steps of joint velocities or accelerations in which the joint does not move."""
     if positions is None or group.field not in RATE_FIELDS or not np.isin(group.samples, positions.samples).all():
         return np.zeros(steps.shape, bool)
     columns = [positions.names.index(name) for name in group.names]
@@ -338,12 +339,13 @@ def _channel_findings(group: ChannelGroup, all_repeated: BoolArray, columns: np.
         yield _frozen_finding(group, channels, frozen, count)
     if dead:
         texts = [
-            f"{name} below {least:.3g} {channel_unit(group.field, name)} ({format_percent(share)} % of it)"
+            f"{name} below {least:.3g} {channel_unit(group.field, name)} ({format_percent(share)} % of samples)"
             for name, least, share in dead
         ]
-        advice = "switch the dead band off; a velocity may be left out, and is derived then"
+        advice = "switch the dead band off; or remove a velocity: torchid then derives it"
         names = tuple(name for name, _, _ in dead)
-        yield Finding("dead band", SUSPICIOUS, group.field, f"reads 0: {join_names(texts)}", advice, names)
+        text = f"small values read 0: {join_names(texts)}"
+        yield Finding("dead band", SUSPICIOUS, group.field, text, advice, names)
     if limits:
         yield _saturated_finding(group, limits)
     if any(holds.values()):
@@ -363,8 +365,8 @@ def _frozen_finding(group: ChannelGroup, channels: str, frozen: _RunsByChannel, 
     if count > 1:
         times = f"{count} times, the longest {times}"
     prefix = f"{group.name}, " if group.name else ""
-    text = f"{prefix}{channels}: repeated to the last bit while the robot moves, {times}"
-    advice = "leave these samples out; look for lost messages or a stalled driver"
+    text = f"{prefix}{channels}: exactly constant while the robot moves, {times}"
+    advice = f"{EXCLUDE_ADVICE}; look for lost messages or a stalled driver"
     return Finding("frozen", REJECTED, group.field, text, advice, tuple(name for name, _ in frozen), spans)
 
 
@@ -375,13 +377,13 @@ def _saturated_finding(group: ChannelGroup, limits: list[tuple[str, Runs, float]
         (name, extreme, format_percent(float(np.mean(group.values[:, group.names.index(name)] == extreme))))
         for name, _, extreme in limits
     ]
-    text = "stays at an extreme value: " + join_names(
+    text = "stays at its limit: " + join_names(
         [f"{name} at {extreme:.4g} {channel_unit(group.field, name)} in {share} %" for name, extreme, share in shares]
     )
     if group.field == "joint_position":  # an end stop, or a limit of inverse kinematics
-        advice = "none if these are the joints' stops; else widen the bounds of the encoder or inverse kinematics"
+        advice = "nothing if the joint has a stop there; else widen the limits of the encoder or inverse kinematics"
         return Finding("saturated", SUSPICIOUS, group.field, text, advice, names, spans)
-    advice = "leave these samples out, or raise the sensor's range"
+    advice = f"{EXCLUDE_ADVICE}, or raise the sensor's range"
     return Finding("saturated", REJECTED, group.field, text, advice, names, spans)
 
 
@@ -389,9 +391,8 @@ def _held_finding(group: ChannelGroup, held: list[tuple[str, float]]) -> Finding
     hold = max(samples for _, samples in held)
     names = tuple(name for name, _ in held)
     prefix = f"{join_names(names)}: " if len(names) < len(group.names) else ""
-    delay = f"{0.5 * (hold - 1):.2g} samples late on average"
-    text = f"{prefix}new values only every {hold:.3g} samples, repeated in between: {delay}"
-    advice = f"record at one rate, or set preprocessing.cutoff_hz below {0.25 / hold:.2g} of the sample rate"
+    text = f"{prefix}new values only every {hold:.3g} samples; mean delay {0.5 * (hold - 1):.2g} samples"
+    advice = f"record all at one rate, or set preprocessing.cutoff_hz below {0.25 / hold:.2g} of the sample rate"
     return Finding("held", SUSPICIOUS, group.field, text, advice, names)
 
 
@@ -401,22 +402,22 @@ def _moves(positions: ChannelGroup | None) -> bool:
 
 
 def _constant_findings(group: ChannelGroup, constant: BoolArray, moves: bool) -> Iterator[Finding]:
-    """Findings about channels (c,) that never change, those that are 0 apart from those at another value."""
+    """Findings about channels (c,) that never change; one for zeros, one for other values."""
     zero = constant & ~group.values[0].astype(bool)
     is_force = group.field in FORCE_FIELDS
-    for still, value in ((zero, "0"), (constant & ~zero, "one value")):
+    for still, value in ((zero, "0"), (constant & ~zero, "the same value")):
         names = tuple(name for name, here in zip(group.names, still, strict=True) if here)
         if not names or (value == "0" and group.field in WRENCHES):  # moments of a point contact
             continue
         severity = NOTE
-        advice = "none if the robot does not move there: constant channels add no information"
+        advice = "nothing if the robot does not move there: constant channels add no information"
         if value == "0" and group.field == "joint_torque":
             severity = SUSPICIOUS
             advice = "write NaN if they were not measured: zeros are fitted as measured torques"
         elif value != "0" and is_force and moves:
             severity = SUSPICIOUS
             advice = "write NaN if they were not measured: a sensor's readings change while joints move"
-        yield Finding("constant", severity, group.field, f"{join_names(names)}: {value} throughout", advice, names)
+        yield Finding("constant", severity, group.field, f"{join_names(names)}: always {value}", advice, names)
 
 
 def _mean_hold(values: FloatArray, repeated: BoolArray) -> float:
@@ -526,9 +527,9 @@ def _smallest_difference(sides: list[FloatArray], rounding: FloatArray) -> Float
 
 
 def check_still_base(log: Log) -> Iterator[Finding]:
-    """A finding about a position of the base that never changes although the base turns: it was not measured.
+    """A finding about a base position that never changes although the base turns: it was not measured.
 
-    A base that is held neither turns nor moves, and one that turns about its origin for good is none.
+    A base that is held neither turns nor moves; no base always turns exactly about its origin.
     """
     position = log.base_position_world
     quat = log.base_quat_xyzw
@@ -536,17 +537,17 @@ def check_still_base(log: Log) -> Iterator[Finding]:
         return
     if (turned := _turned_deg(quat)) < MIN_TURN_DEG:
         return
-    text = f"one position throughout, though the base turns by {turned:.2g} degrees"
+    text = f"the position never changes, but the base turns by {turned:.2g} degrees"
     others = (log.base_linear_velocity_world, log.base_linear_acceleration_world, log.imu_specific_force)
     severity = SUSPICIOUS if all(other is None for other in others) else NOTE  # else nothing is derived from it
-    advice = "leave it out and give an IMU or the base's velocity, or set preprocessing.base_motion: contacts"
+    advice = "remove it and give an IMU or the base's velocity, or set preprocessing.base_motion: contacts"
     yield Finding("constant position", severity, "base_position_world", text, advice)
 
 
 def check_excitation(log: Log) -> Iterator[Finding]:
-    """A note of a log in which nothing moves: forces of a robot at rest tell weights alone, in one posture.
+    """A note about a log in which nothing moves: its forces determine only weights, in one posture.
 
-    It is no fault: such logs tell offsets, or complete others.
+    This is no mistake: such logs determine offsets, or complete other logs.
     """
     position = log.base_position_world
     quat = log.base_quat_xyzw
@@ -555,8 +556,8 @@ def check_excitation(log: Log) -> Iterator[Finding]:
         return
     if quat is not None and _turned_deg(quat) > MIN_TURN_DEG:
         return
-    text = f"nothing moves: no joint by more than {moved:.2g} rad (slides: m)"
-    advice = "record motion: one posture determines what balances gravity in it, no inertia and no friction"
+    text = f"nothing moves: the largest joint motion is {moved:.2g} rad (or m)"
+    advice = "record motion: one posture determines only its gravity load, no inertia and no friction"
     yield Finding("no motion", NOTE, "joint_position", text, advice)
 
 
@@ -566,9 +567,9 @@ _FEWEST_OF_REST = 100
 
 
 def check_rest(log: Log) -> Iterator[Finding]:
-    """A note of joints with a torque that rest while others move: what friction holds them then is not Coulomb's.
+    """A note about joints with a torque that rest while others move: their friction is then below Coulomb friction.
 
-    Of positions a tenth of a second apart, whose noise is what is not smooth from sample to sample.
+    It compares positions 0.1 s apart; their noise is the part that is not smooth from sample to sample.
     """
     lag = max(1, round(_REST_LAG_S / float(np.median(np.diff(log.time))))) if len(log) > 1 else 1
     if log.joint_torque is None or len(log) < lag + _FEWEST_OF_REST:
@@ -581,11 +582,11 @@ def check_rest(log: Log) -> Iterator[Finding]:
     if order and np.ptp(log.joint_position, axis=0).max() > MIN_MOTION:
         names = [log.joint_names[joint] for joint in order]
         named = join_names([f"{name} {100.0 * share[joint]:.0f} %" for name, joint in zip(names, order, strict=True)])
-        text = f"much of the time: {named}; where a joint sticks, friction is anything below Coulomb's"
-        advice = "fit with actuators.stiction: true, or record joints that turn without pauses"
+        text = f"joints rest much of the time: {named}. At rest, friction has any value up to Coulomb friction"
+        advice = "set actuators.stiction: true, or record motion without pauses"
         yield Finding("rest", NOTE, "joint_position", text, advice, tuple(names))
 
 
 def _turned_deg(quat: FloatArray) -> float:
-    """The largest turn [degrees] of orientations (N, 4) from the first."""
+    """The largest turn [degrees] of orientations (N, 4) from the first one."""
     return float(np.degrees(2.0 * np.arccos(np.clip(np.abs(quat @ quat[0]), 0.0, 1.0))).max())

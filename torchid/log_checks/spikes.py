@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import format_count, join_names, warn
 from torchid.log_checks.findings import (
+    EXCLUDE_ADVICE,
     NEIGHBOUR_STEPS,
     NOTE,
     REJECTED,
@@ -94,21 +95,21 @@ def check_jumps(log: Log, groups: Iterable[ChannelGroup]) -> Iterator[Finding]:
         spikes = [(name, jump) for name, jump in in_field if not jump.lasting]
         steps = [(name, jump) for name, jump in in_field if jump.lasting]
         if spikes and field.endswith(_ACCELERATION_SUFFIXES):
-            yield _finding("spike", SUSPICIOUS, field, spikes, "none if there was an impact")
+            yield _finding("spike", SUSPICIOUS, field, spikes, "nothing if there was an impact")
         elif spikes:
-            yield _finding("spike", REJECTED, field, spikes, "leave these samples out; look for a loose contact")
+            yield _finding("spike", REJECTED, field, spikes, f"{EXCLUDE_ADVICE}; look for a loose connector")
         if field in POSITION_FIELDS:
             yield from _position_steps(field, steps, len(log))
         elif steps and field in _FORCE_FIELDS:
-            advice = "if the sensor was reset there, split the log: each part has its own offset"
+            advice = "if the sensor was reset there, split the log: each part then has its own offset"
             yield _finding("step", SUSPICIOUS, field, steps, advice)
 
 
 def warn_of_steps(log: Log) -> None:
-    """Warn of joint positions that step, which a filter smears into accelerations and masses make up for in part.
+    """Warn about steps of joint positions: a filter turns them into accelerations, which bias masses.
 
     Warns:
-        TorchidWarning: an encoder has another zero on either side, or an angle is wrapped.
+        TorchidWarning: an encoder's zero changes at a step, or an angle is wrapped.
     """
     for jump in check_jumps(log, channel_groups(log, ("joint_position",))):
         if jump.severity == REJECTED and jump.name != "spike":
@@ -139,7 +140,7 @@ def _near_load_changes(log: Log, candidates: Iterable[tuple[ChannelGroup, list[l
 
 
 def _unexplained(log: Log, group: ChannelGroup, column: int, jumps: list[Jump], impacts: BoolArray) -> list[Jump]:
-    """Jumps of a channel that neither motion nor contact explains; a step beyond the range has no samples on a side."""
+    """Jumps of a channel that neither motion nor contact explains."""
     values = group.values[:, column]
     if group.field in POSITION_FIELDS:
         return [jump for jump in jumps if abs(jump.size) > MIN_POSITION_JUMP]
@@ -179,7 +180,7 @@ def _is_reset(values: FloatArray, jump: Jump) -> bool:
 
 
 def _position_steps(field: str, steps: _Jumps, samples: int) -> Iterator[Finding]:
-    """Findings about steps of positions: the zero differs on one side, which is rejected if it is short."""
+    """Findings about steps of positions: the zero changes there; the shorter side is rejected if it is short."""
     kinds: dict[str, _Jumps] = {}
     for name, jump in steps:
         largest = max(abs(step.size) for _, step in steps if step.first == jump.first)
@@ -187,22 +188,23 @@ def _position_steps(field: str, steps: _Jumps, samples: int) -> Iterator[Finding
     for kind, jumps in kinds.items():
         if kind == "wrapped":
             spans = tuple(_span(name, jump, 2.0 * np.pi * _turns(jump)) for name, jump in jumps)
-            advice = f"logs.columns.{field}.turn_from, where its turn begins, such as -180 of deg; or unwrap it"
-            advice = advice if field == "joint_position" else "unwrap the angle"
+            advice = "unwrap the angle"
+            if field == "joint_position":
+                advice += ", or set logs.columns.joint_position.turn_from to the start of its turn, such as -180 [deg]"
             yield _finding("wrapped angle", REJECTED, field, jumps, advice, spans)
         elif kind == "displacement":
             spans = tuple(_span(name, jump, jump.size) for name, jump in jumps)
-            advice = "leave these samples out; only the motion of the base matters, not its position"
+            advice = f"{EXCLUDE_ADVICE}: only the motion of the base matters, not its position"
             yield _finding("step", REJECTED, field, jumps, advice, spans)
         elif kind == "harmless":
-            advice = "none at this size; look for a marker or an encoder that slipped"
+            advice = "nothing at this size; look for a marker or an encoder that slipped"
             yield _finding("step", NOTE, field, jumps, advice)
         elif kind == "short":
             spans = tuple(_shorter_side(jump, name, samples) for name, jump in jumps)
-            advice = "leave out the shorter side, which has another zero"
+            advice = "exclude the shorter side (preprocessing.exclude_rejected: true): its zero differs"
             yield _finding("step", REJECTED, field, jumps, advice, spans)
         else:
-            advice = "split the log there and determine which part has the right zero"
+            advice = "split the log there, and find out which part has the right zero"
             yield dataclasses.replace(_finding("step", REJECTED, field, jumps, advice), everywhere=True)
 
 
@@ -233,16 +235,16 @@ def _finding(
 ) -> Finding:
     channels = tuple(dict.fromkeys(channel for channel, _ in jumps))
     channel, clearest = max(jumps, key=lambda pair: pair[1].spreads)
-    samples = f"from {clearest.first} to {clearest.last}" if clearest.lasting else f"at {_span('', clearest)}"
+    at = _span("", clearest)
     size = abs(clearest.size)
     unit = channel_unit(field, channel)
     if field == "base_quat_xyzw":
         size = np.degrees(2.0 * size)
         unit = "deg"
-    text = f"{channel} by {size:.3g} {unit} {samples}, {clearest.spreads:.3g} times the noise around it"
+    text = f"{channel} jumps by {size:.3g} {unit} at sample {at}, {clearest.spreads:.3g} times the local noise"
     if len(jumps) > 1:
         count = len({(jump.first, jump.last) for _, jump in jumps})
-        text = f"{format_count(count, 'jump')} in {join_names(channels)}; the clearest: {text}"
+        text = f"{format_count(count, 'jump')} in {join_names(channels)}. The clearest: {text}"
     if spans is None:
         spans = tuple(_span(channel, jump) for channel, jump in jumps)
     return Finding(name, severity, field, text, advice, channels, spans)

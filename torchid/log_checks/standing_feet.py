@@ -21,7 +21,14 @@ from torchid.log_checks.findings import (
     median_step,
 )
 from torchid.log_checks.mistakes import Mistake, exchanged_joints, possible_mistakes, reversed_joints
-from torchid.log_checks.motion import LinkPoses, joints_of_limb, recorded_link_poses, same_poses, still_in_limb
+from torchid.log_checks.motion import (
+    DEAD_ENCODER_ADVICE,
+    LinkPoses,
+    joints_of_limb,
+    recorded_link_poses,
+    same_poses,
+    still_in_limb,
+)
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.quaternion import rotate_to_world
@@ -71,7 +78,7 @@ _STANDING_FEET_CHECK = "feet that stand"
 def check_standing_feet(
     log: Log, robot: Robot | None, contacts: Sequence[Contact], derived: tuple[str, ...] = ()
 ) -> Iterator[Finding | Skipped]:
-    """Findings about feet that move while their flag is set, not to be blamed on fields that begin with `derived`."""
+    """Findings about feet that move while their flag is set; `derived`: prefixes of fields that torchid computed."""
     if robot is None or not contacts or robot.fixed_base:
         return
     log = log.select(slice(None, None, max(1, len(log) // _MAX_COMPARED_SAMPLES)))
@@ -79,7 +86,7 @@ def check_standing_feet(
     poses = recorded_link_poses(log, robot) if has_poses else None
     slip = measure_foot_slip(log, robot, contacts, poses)
     if slip is None:
-        yield Skipped(_STANDING_FEET_CHECK, "no orientation of the base, or no stance above which the base moves")
+        yield Skipped(_STANDING_FEET_CHECK, "no orientation of the base, or the base never moves while a foot stands")
         return
     radius = list(_radius_findings(log, robot, contacts, poses))
     yield from radius
@@ -105,7 +112,7 @@ def _usual_mistake(
     poses: LinkPoses | None,
     derived: tuple[str, ...],
 ) -> Finding | None:
-    """A finding about the usual mistake without which standing feet keep still best."""
+    """A finding about the usual mistake whose correction makes standing feet move least."""
     best = None
     least = MAX_SLIP_RESIDUAL_SHARE * slip
     for mistake in (*possible_mistakes(log, robot), *reversed_joints(log)):
@@ -121,14 +128,14 @@ def _usual_mistake(
 
 
 def _corrected(mistake: Mistake, slip: float, least: float) -> Finding:
-    """A finding about a mistake without which standing feet keep still."""
-    share = f"{100 * slip:.3g} % as much as the base above them, {format_percent(least)} % once corrected"
+    """A finding about a mistake whose correction makes standing feet keep still."""
+    share = f"{100 * slip:.3g} % as much as the base, {format_percent(least)} % after correction"
     text = f"{mistake.description}: standing feet move {share}"
     return Finding("unit, sign or frame", REJECTED, mistake.field, text, mistake.advice)
 
 
 def _exchanged_joints(log: Log, robot: Robot, contacts: Sequence[Contact], slip: float) -> Finding | None:
-    """A finding about any two joints whose names are exchanged, one of them at least between a foot and the base."""
+    """A finding about any two joints with exchanged names, at least one of them between a foot and the base."""
     every = max(1, int(_TRIAL_STEP_S / median_step(log)))
     thinned = log.select(slice(0, every * _MAX_TRIAL_SAMPLES, every))
     legs = {name for contact in contacts for name in joints_of_limb(robot, contact.frame)}
@@ -142,20 +149,19 @@ def _exchanged_joints(log: Log, robot: Robot, contacts: Sequence[Contact], slip:
 def _unexplained_motion(
     log: Log, robot: Robot, contacts: Sequence[Contact], slip: float, poses: LinkPoses | None
 ) -> Finding:
-    """A finding about feet that move though they stand, which no usual mistake explains, with those that move most."""
+    """A finding about standing feet that move, not explained by a usual mistake; the fastest feet come first."""
     alone = {c.frame: measure_foot_slip(log, robot, [c], poses) for c in contacts}
     moving = sorted((name for name, share in alone.items() if share), key=lambda name: -(alone[name] or 0.0))
     most = join_names([f"{name} {format_percent(alone[name] or 0.0)} %" for name in moving])
-    text = f"standing feet move {100 * slip:.3g} % as much as the base above them{UNEXPLAINED}"
-    advice = "check signs, scales and zeros of joint positions, the base's orientation and position, the flags, and"
-    advice += " the frames under contacts"
+    text = f"standing feet move {100 * slip:.3g} % as much as the base{UNEXPLAINED}"
+    advice = "check signs, scales and zeros of joint positions, the base's pose, flags, and frames under contacts"
     return Finding("standing feet", SUSPICIOUS, "all", f"{text}: {most}" if most else text, advice, tuple(moving))
 
 
 def _single_foot(
     log: Log, robot: Robot, contacts: Sequence[Contact], slip: float, poses: LinkPoses | None
 ) -> Finding | None:
-    """A finding about the one foot that moves though it stands while the others do not."""
+    """A finding about the single standing foot that moves."""
     if slip < MIN_SINGLE_SHARE:
         return None
     without = {c.frame: measure_foot_slip(log, robot, [x for x in contacts if x is not c], poses) for c in contacts}
@@ -163,19 +169,19 @@ def _single_foot(
     frame = min(remaining, key=lambda name: remaining[name], default="")
     if not frame or remaining[frame] > MAX_OTHERS_SHARE * slip:
         return None
-    text = f"{frame} moves though it stands: standing feet move {format_percent(slip)} % as much as the base above"
-    text += f" them, {format_percent(remaining[frame])} % without it"
+    text = f"{frame} moves though its flag is on: standing feet move {format_percent(slip)} % as much as the base,"
+    text += f" {format_percent(remaining[frame])} % without it"
     advice = "check zeros, scales and signs of the joint positions in its limb, its flags, and whether it slips"
     if still := join_names(still_in_limb(log, robot, frame)):
-        text += f"; {still} of its limb stands still throughout: a dead encoder?"
-        advice = f"look whether {still} moves, for a dead encoder, and leave the log out; else {advice}"
+        text += f". {still} in its limb never moves: is its encoder dead?"
+        advice = f"{DEAD_ENCODER_ADVICE}; else {advice}"
     return Finding("standing feet", SUSPICIOUS, "joint_position", text, advice, (frame,))
 
 
 def _pose_findings(log: Log, contacts: Sequence[Contact], slip: float, poses: LinkPoses) -> Iterator[Finding]:
-    """A finding about a pose of the base that is another frame's, or late: with it all standing feet keep still.
+    """A finding about a base pose of another frame or another time: its correction makes standing feet keep still.
 
-    Markers of motion capture are seldom at the base link's origin, and their axes seldom its own.
+    Motion capture markers are rarely at the base link's origin or along its axes.
     """
     quat = log.base_quat_xyzw
     place = log.base_position_world
@@ -214,19 +220,19 @@ def _pose_findings(log: Log, contacts: Sequence[Contact], slip: float, poses: Li
 
 
 def _pose_finding(x: FloatArray, slip: float, residual: float) -> Finding:
-    """A finding about a frame at x[:3] [m], turned by x[3:6] [rad], in the base, whose pose is x[6] [s] late."""
+    """A finding about the pose of a frame at x[:3] [m], turned by x[3:6] [rad], in the base, that is x[6] [s] late."""
     at, turn = (", ".join(f"{value:.0f}" for value in values) for values in (1e3 * x[:3], np.degrees(x[3:6])))
     parts = [f"of a point at ({at}) mm of the base link"] if x[:3].any() else []
     parts += [f"turned about it by ({turn}) degrees"] if x[3:6].any() else []
     parts += [f"{1e3 * abs(x[6]):.0f} ms {'late' if x[6] > 0.0 else 'early'}"] if x[6] else []
-    text = f"standing feet move {format_percent(slip)} % as much as the base above them, {format_percent(residual)} %"
-    text += f" of that if the base's pose is {join_names(parts)}"
-    advice = "give the pose of the base link itself; shift_s delays files of a log"
+    text = f"standing feet move {format_percent(slip)} % as much as the base, but {format_percent(residual)} % of that"
+    text += f" if the base's pose is {join_names(parts)}"
+    advice = "give the pose of the base link itself; shift_s corrects a late file"
     return Finding("frame", SUSPICIOUS, "base_quat_xyzw", text, advice)
 
 
 def _radius_findings(log: Log, robot: Robot, contacts: Sequence[Contact], poses: LinkPoses | None) -> Iterator[Finding]:
-    """A finding about feet that roll on another radius than stated, by more than feet that creep make of it."""
+    """A finding about feet that roll with another radius than stated, by more than creeping feet do."""
     points = [c for c in contacts if c.kind == "point" and c.frame in log.contact_names and c.frame in robot.links]
     windows = [] if poses is None or log.base_quat_xyzw is None else list(_rolling_windows(log, points, poses))
     if len(windows) < _FEWEST_WINDOWS:
@@ -241,11 +247,11 @@ def _radius_findings(log: Log, robot: Robot, contacts: Sequence[Contact], poses:
     error = np.linalg.norm(weight * (products - radius * unit)) / max(weight @ unit, np.finfo(float).tiny)
     stated = float(np.mean([c.radius for c in points]))
     if radius > 0.0 and abs(radius - stated) > max(_RADIUS_SHARE * max(radius, stated), _RADIUS_ERRORS * error):
-        text = f"standing feet move as balls of {1e3 * radius:.3g} mm (± {1e3 * error:.1g}) that roll, stated are"
-        text += f" {1e3 * stated:.3g} mm; feet that creep seem smaller"
+        text = f"standing feet roll like balls with a radius of {1e3 * radius:.3g} mm (± {1e3 * error:.1g});"
+        text += f" the stated radius is {1e3 * stated:.3g} mm. Creeping feet seem smaller"
         centre = f", centre: {join_numbers(points[0].centre)}" if any(points[0].centre) else ""
         entry = f"{{frame: {points[0].frame}, type: point, radius: {radius:.3g}{centre}}}"
-        advice = f"contacts: [{entry}, ...], if the feet are balls"
+        advice = f"set contacts: [{entry}, ...] if the feet are balls"
         yield Finding("radius", SUSPICIOUS, "contact_names", text, advice, tuple(c.frame for c in points))
 
 

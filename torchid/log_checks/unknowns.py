@@ -1,7 +1,7 @@
-"""Mistakes that are numbers: of each kind the forces that a unit of it adds, and how a clear one is named.
+"""Mistakes with a size, such as an offset or a lag: their columns in the force equations, and their findings.
 
-A kind is one row of `kinds`: unknowns with their columns, beside all URDFs near the given one. All are estimated in the
-same equations and judged by one rule; the kind whose clear unknowns leave least of the forces unexplained is named.
+A kind is one row of `kinds`: unknowns with their columns, estimated together with small changes of the URDF. All kinds
+use the same equations and one rule; the finding names the kind that explains the forces best.
 """
 
 from __future__ import annotations
@@ -88,13 +88,13 @@ _OF_JOINTS = ("joint_position", "joint_velocity", "joint_acceleration")
 
 
 def best_explanation(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> Explanation | None:
-    """The kind of mistake without which least of the forces is unexplained, if that is much less.
+    """The kind of mistake that explains the forces best, if its correction helps much.
 
-    Others that explain as much are named beside it.
+    The finding also names kinds that explain as much.
 
     Args:
         filtered: the log.
-        derived: how names of fields begin that were not recorded.
+        derived: prefixes of fields that torchid computed.
 
     Raises:
         InputError: the log cannot be filtered, or does not match the robot.
@@ -117,9 +117,9 @@ def best_explanation(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> Ex
         and other.findings[0].field not in {finding.field for finding in best.findings}
     ]
     first, *more = best.findings
-    also = "".join(f"; or {text}, which explains as much" for text in others)
+    also = "".join(f". As likely: {text}" for text in others)
     ratio = equations.unexplained / max(best.left, 1e-9)
-    found_text = f"{first.found}{also}; without this correction {ratio:.2g} times as much of the forces is unexplained"
+    found_text = f"{first.found}{also}; unexplained forces are {ratio:.2g} times as large as after correction"
     return replace(best, findings=[replace(first, found=found_text), *more])
 
 
@@ -127,7 +127,7 @@ def best_explanation(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> Ex
 
 
 def kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[str, ...]) -> Iterator[Kind]:
-    """All kinds of mistakes that the forces of a log may show."""
+    """All kinds of mistakes that forces can show."""
     log = filtered.log
     model = filtered.model
     torque = log.joint_torque
@@ -199,7 +199,7 @@ def _torque_kinds(log: Log, equations: ForceEquations) -> Iterator[Kind]:
         def exchanged(which: Sequence[int], _: Estimate) -> list[Finding]:
             pair = tuple(names[k] for k in pairs[which[0]])
             text = f"{join_names(pair)} exchanged"
-            advice = "give torques in the order of joint_names, as positions"
+            advice = "give torques in the order of joint_names"
             return [Finding("unit, sign or frame", REJECTED, "joint_torque", text, advice, pair)]
 
         yield Kind(change, 1.0, _is_whole, exchanged, single=True, constants=False)
@@ -222,7 +222,7 @@ def _torque_kinds(log: Log, equations: ForceEquations) -> Iterator[Kind]:
 
 
 def _readings_kind(filtered: FilteredLog, equations: ForceEquations) -> Kind | None:
-    """Usual mistakes of torques and wrenches alone: what correcting each of them changes, of which all is missing."""
+    """Usual mistakes of torques and wrenches only; the column of each is the whole change by its correction."""
     model = filtered.model
     possible = possible_mistakes(filtered.log, filtered.model.robot)
     mistakes = [mistake for mistake in possible if mistake.field in READINGS]
@@ -262,18 +262,16 @@ def _beyond(x: FloatArray, ratio: float) -> BoolArray:
 
 
 def _common_gain(gain: float, spread: float, robot: Robot) -> Finding:
-    text = f"all torques: the factor that fits the {robot.format} best is {gain:.3g} +- {spread:.2g}"
+    text = f"all torques: the {robot.format} fits best with a factor of {gain:.3g} +- {spread:.2g}"
     if _is_reverse(np.array(gain - 1.0)):
-        advice = "reverse them; a base that hangs upside down looks the same (give base_quat)"
+        advice = "reverse them. An upside-down base looks the same: give base_quat to exclude it"
         return Finding("unit, sign or frame", REJECTED, "joint_torque", f"all reversed: {text}", advice)
     scales = "set sensors.scales: {joint_torque: all}"
     if units := units_of_ratio(1.0 / gain, ("torque",)) if gain > 0.0 else ():
-        advice = f"{advise_units({'joint_torque': units})}; without a map multiply by {gain:.4g}; of currents, {scales}"
+        advice = f"{advise_units({'joint_torque': units})}, or multiply by {gain:.4g}; for motor currents {scales}"
         return Finding("unit, sign or frame", REJECTED, "joint_torque", f"in {' or '.join(units)}: {text}", advice)
-    advice = (
-        f"check units, gear ratios and torque constants, whether the {robot.format}'s masses and contact forces are"
-    )
-    return Finding("scale", SUSPICIOUS, "joint_torque", text, f"{advice} right, or {scales}")
+    advice = f"check units, gear ratios, torque constants, contact forces and the {robot.format}'s masses, or {scales}"
+    return Finding("scale", SUSPICIOUS, "joint_torque", text, advice)
 
 
 def _single_gains(names: Sequence[str], gain: FloatArray, spread: FloatArray, robot: Robot) -> list[Finding]:
@@ -289,9 +287,9 @@ def _single_gains(names: Sequence[str], gain: FloatArray, spread: FloatArray, ro
     ]
     out = []
     for name, x, std in zip(names, gain, spread, strict=True):
-        text = f"the factor that fits the {robot.format} best is {x:.3g} +- {std:.2g}"
+        text = f"the {robot.format} fits best with a factor of {x:.3g} +- {std:.2g}"
         if _is_reverse(np.array(x - 1.0)):
-            hangs = "; or robot.base_tilt, if the base is not upright" if robot.fixed_base else ""
+            hangs = ", or set robot.base_tilt if the base is not upright" if robot.fixed_base else ""
             kind = "sign"
             severity = REJECTED
             text = f"reversed; {text}"
@@ -303,8 +301,8 @@ def _single_gains(names: Sequence[str], gain: FloatArray, spread: FloatArray, ro
             text = f"in {given}; {text}"
             advice = f"give {'forces' if expected == 'N' else 'torques'} in {expected}"
         else:
-            advice = f"check gear ratios, torque constants and units, and the {robot.format}'s friction and inertias"
-            advice += f" there, or set sensors.scales: {{joint_torque: [[{', '.join(of_unknown_scale)}]]}}"
+            advice = f"check gear ratio, torque constant, unit, and the {robot.format}'s friction and inertias there,"
+            advice += f" or set sensors.scales: {{joint_torque: [[{', '.join(of_unknown_scale)}]]}}"
             kind = "scale"
             severity = SUSPICIOUS
         out.append(Finding(kind, severity, "joint_torque", f"{name}: {text}", advice, (name,)))
@@ -376,9 +374,9 @@ def _contact_columns(equations: ForceEquations) -> tuple[FloatArray, FloatArray]
 
 def _common_wrench(estimate: Estimate, robot: Robot, field: str) -> list[Finding]:
     gain = 1.0 + float(estimate.value[0])
-    text = f"all wrenches: the factor that fits the {robot.format} best is {gain:.3g} +- {estimate.spread[0]:.2g}"
+    text = f"all wrenches: the {robot.format} fits best with a factor of {gain:.3g} +- {estimate.spread[0]:.2g}"
     if _is_reverse(np.array(gain - 1.0)):
-        advice = "reverse it: wrenches are what the ground exerts on the robot"
+        advice = "reverse the wrenches: give what the ground exerts on the robot"
         return [Finding("unit, sign or frame", REJECTED, field, f"all reversed: {text}", advice)]
     units = units_of_ratio(1.0 / gain, ("force",)) if gain > 0.0 else ()
     advice = f"convert forces to N and moments to N m: multiply by {gain:.4g}"
@@ -395,34 +393,34 @@ def _single_wrenches(frames: Sequence[str], estimate: Estimate, robot: Robot, fi
         if gain > 0.0 and angle > MIN_TURN:
             axis = ", ".join(f"{y:.2g}" for y in np.round(np.array(turn) / size, 2))
             kind = "frame"
-            text = f"turned by {np.degrees(angle):.2g} degrees about ({axis})"
-            advice = "check how the sensor is mounted, and the frame that its readings are given in"
+            text = f"if forces are turned by {np.degrees(angle):.2g} degrees about ({axis})"
+            advice = "check the sensor's mounting and the frame of its readings"
         else:
-            kind, text = ("scale", "") if gain > 0.0 else ("sign", "reversed; ")
-            text += f"times {gain:.3g} +- {std:.2g}"
-            advice = "check the sensor's sign, gain and unit, and whether these readings are another foot's"
-        text = f"{name}: forces fit the {robot.format} best {text}"
+            kind = "scale" if gain > 0.0 else "sign"
+            text = f"with a factor of {gain:.3g} +- {std:.2g} on its forces"
+            advice = "check the sensor's sign, gain and unit, and whether the readings belong to another foot"
+        text = f"{name}: the {robot.format} fits best {text}"
         out.append(Finding(kind, SUSPICIOUS, field, text, advice, (name,)))
     return out
 
 
 def _point(shift: FloatArray, log: Log, robot: Robot) -> Finding:
     at = ", ".join(f"{1e3 * x:.0f}" for x in shift)
-    text = f"forces and moments fit the {robot.format} about a point {at} mm from the contact frames' origins"
+    text = f"the {robot.format} fits best with moments about a point at {at} mm in the contact frames"
     advice = "give moments about the contact frame's origin, or name the sensor's own frame as the contact"
     if log.moments_about_world_origin:
-        advice = "check the points of the moments, where the plates lie, and the base's position in the same world"
+        advice = "check the reference points of moments, the positions of force plates, and the base's position"
     severity = SUSPICIOUS
     if _is_centre_of_base(log, robot, float(np.linalg.norm(shift))):
         severity = NOTE
-        advice = f"none if its base's centre of mass may be as far off; else {advice}"
+        advice = f"nothing if the base's centre of mass may have this error; else {advice}"
     return Finding("point", severity, log.contact_wrench_field, text, advice)
 
 
 def _is_centre_of_base(log: Log, robot: Robot, shift: float) -> bool:
-    """Whether the base's centre of mass explains another point of wrenches on the base alone, as of a drone's rotors.
+    """Whether a wrong centre of mass of the base explains the point of wrenches that act only on the base (a drone).
 
-    Weight and inertia act alike on both; a centre of mass is off by less than the body's radius of gyration.
+    Both change weight and inertia alike; the error of a centre of mass is below the body's radius of gyration.
     """
     mass, _, inertia = mass_com_inertia(robot.nominal[0])
     if mass <= 0.0 or any(robot.link(frame)[0] for frame in log.contact_names):
@@ -432,14 +430,14 @@ def _is_centre_of_base(log: Log, robot: Robot, shift: float) -> bool:
 
 
 def _gravity_kind(equations: ForceEquations) -> Kind:
-    """Share of gravity's part of the torques that the readings lack."""
+    """Share of the gravity torques that is missing in the readings."""
     samples = equations.samples
     zero = torch.zeros_like(samples.joint_velocity)
     still = replace(samples, joint_velocity=zero, joint_acceleration=zero)
 
     def findings(_: Sequence[int], estimate: Estimate) -> list[Finding]:
         percent = f"{100.0 * estimate.value[0]:.0f} +- {100.0 * estimate.spread[0]:.0f} %"
-        text = f"torques lack {percent} of gravity: has a controller subtracted it?"
+        text = f"torques lack {percent} of gravity. Did a controller subtract it?"
         advice = "record torques before gravity is subtracted, or add what was subtracted"
         return [Finding("gravity", REJECTED, "joint_torque", text, advice)]
 
@@ -449,7 +447,7 @@ def _gravity_kind(equations: ForceEquations) -> Kind:
 
 
 def _stop_kind(log: Log, equations: ForceEquations) -> Kind | None:
-    """Forces with which joints push against limits that they reach at times; None where none is reached."""
+    """Forces of joints against limits that they reach at times; None if they reach none."""
     robot = equations.model.robot
     samples = equations.samples
     limits = position_limits(robot.path) if robot.format == "URDF" else {}
@@ -467,7 +465,7 @@ def _stop_kind(log: Log, equations: ForceEquations) -> Kind | None:
                 pushed.append((name, limit))
 
     def findings(which: Sequence[int], estimate: Estimate) -> list[Finding]:
-        advice = "leave these samples out: a stop's force is in no model; or record motion within the limits"
+        advice = "exclude these samples, or record motion within the limits: the model has no joint stops"
         out = []
         for number, x, std in zip(which, estimate.value, estimate.spread, strict=True):
             name, limit = pushed[number]
@@ -481,7 +479,7 @@ def _stop_kind(log: Log, equations: ForceEquations) -> Kind | None:
 
 
 def _zero_columns(equations: ForceEquations) -> FloatArray:
-    """What the forces that are required lose for each unit of a joint's position."""
+    """Decrease of the required forces per unit of each joint's position."""
     samples = equations.samples
     level = equations.required
     out = []
@@ -492,7 +490,7 @@ def _zero_columns(equations: ForceEquations) -> FloatArray:
 
 
 def _zero_kind(equations: ForceEquations) -> Kind:
-    """By how much joints are further than is read [rad or m]."""
+    """Error of the joints' zeros: true positions less the readings [rad or m]."""
     samples = equations.samples
     robot = equations.model.robot
 
@@ -504,7 +502,7 @@ def _zero_kind(equations: ForceEquations) -> Kind:
         return None if other is None else (other, _zero_columns(other))
 
     def findings(which: Sequence[int], estimate: Estimate) -> list[Finding]:
-        advice = "check the zero of its encoder, and whether the robot's file counts from the same posture"
+        advice = "check the encoder's zero, and whether the robot's file has its zero at the same posture"
         out = []
         for joint, x, std in zip(which, estimate.value, estimate.spread, strict=True):
             name = robot.joint_names[joint]
@@ -517,7 +515,7 @@ def _zero_kind(equations: ForceEquations) -> Kind:
 
 
 def tilt_kind(equations: ForceEquations) -> Kind:
-    """By how much gravity is turned about x and y of the world, or of a fixed base, from where the log says it is."""
+    """Rotation of gravity about x and y of the world, or of a fixed base, against the log."""
     samples = equations.samples
     model = equations.model
     level = equations.required
@@ -534,14 +532,14 @@ def tilt_kind(equations: ForceEquations) -> Kind:
         advice = f"{advice}, or set robot.base_tilt: auto"
         if model.declared.finds_tilt:
             severity = NOTE
-            advice = "none: robot.base_tilt: auto finds it"
+            advice = "nothing: robot.base_tilt: auto finds it"
         return [Finding("tilt", severity, "base" if robot.fixed_base else "base_quat_xyzw", text, advice)]
 
     return Kind(columns, 0.3, lambda x: np.abs(x) > MIN_TILT, findings, together=2)
 
 
 def check_tilt(samples: Sequence[Samples], model: NominalModel) -> Sequence[Finding]:
-    """A finding about a vertical that gravity is not along, in filtered logs of a robot."""
+    """A finding about a tilted vertical in filtered logs of a robot."""
     equations = ForceEquations.of(some_samples(samples), model)
     explanation = None if equations is None else explain(equations, tilt_kind(equations))
     return () if explanation is None else explanation.findings
@@ -601,7 +599,7 @@ def _clocks(filtered: FilteredLog, derived: tuple[str, ...]) -> Iterator[_Clock]
 
 
 def _lag_kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[str, ...]) -> Iterator[Kind]:
-    """Lags [s] of torques, contact forces, and the motions of base and joints; constant, and changing over the log."""
+    """Lags [s] of torques, contact forces, base motion and joint motion: constant, or changing over the log."""
     model = filtered.model
     time = filtered.log.time
     duration = float(np.ptp(time))
@@ -612,7 +610,7 @@ def _lag_kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[
         return np.asarray((stamps - middle) / duration)
 
     def columns(pieces: Sequence[Log], at: ForceEquations, clock: _Clock, count: int) -> FloatArray:
-        """What the forces that are required beyond those that act lose where a clock's readings are a little later."""
+        """Decrease of the unbalanced forces where a clock's readings are a little later."""
         samples = bind_some_samples([_earlier(piece, clock.moved) for piece in pieces], model.robot, model.contacts)
         lag = (_excess(at, at.samples) - _excess(at, samples))[..., None] / _SMALL
         return lag if count == 1 else np.concatenate([lag, lag * changing(samples.time.numpy())[:, None, None]], axis=2)
@@ -634,7 +632,7 @@ def _lag_kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[
             seconds = float(estimate.value[0])
             spread = 1e3 * float(estimate.spread[0])
             text = f"{clock.what} {1e3 * abs(seconds):.3g} +- {spread:.2g} ms {'later' if seconds > 0.0 else 'earlier'}"
-            advice = "check their stamps and filters; shift_s delays files of a log"
+            advice = "check their stamps and filters; shift_s corrects a late file"
             if clock.field == "joint_torque":
                 delay = model.declared.known_delay - seconds
                 advice = f"check their stamps and filters, or set actuators.delay: {delay:.2g}"
@@ -645,8 +643,8 @@ def _lag_kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[
             end = 1e3 * (estimate.value[0] + 0.5 * estimate.value[1])
             rate = 100.0 * float(estimate.value[1]) / duration
             text = f"{clock.what} {start:.3g} ms later than {clock.than} at the start and {end:.3g} ms at the end"
-            text += f" (+- {1e3 * estimate.spread[1]:.2g} ms): a clock that is {abs(rate):.2g} %"
-            advice = "stamp all sensors by one clock, or multiply the time of these by what makes up for it"
+            text += f" (+- {1e3 * estimate.spread[1]:.2g} ms). Their clock is {abs(rate):.2g} %"
+            advice = "stamp all sensors with one clock, or scale the time of these to match"
             text += " fast" if rate > 0.0 else " slow"
             return [Finding("clock", SUSPICIOUS, clock.field, text, advice, clock.channels)]
 
@@ -661,7 +659,7 @@ def _is_changing_lag(x: FloatArray) -> BoolArray:
 
 
 def _earlier(log: Log, moved: Mapping[str, slice]) -> Log:
-    """The log with some channels as they are a little later, by their slopes."""
+    """The log with some channels a little later, by their slopes."""
     arrays = log.arrays()
     out = dict[str, Any]()
     for name in (name for name in moved if name in arrays):

@@ -183,8 +183,8 @@ def describe_units(found: dict[str, tuple[str, ...]]) -> str:
 
 
 def advise_units(found: dict[str, tuple[str, ...]]) -> str:
-    """What to write in a map of columns: 'logs.columns.time.unit: ms'."""
-    return " or ".join(f"logs.columns.{name}.unit: {' or '.join(units)}" for name, units in found.items())
+    """Advice: 'set logs.columns.time.unit: ms'."""
+    return "set " + " or ".join(f"logs.columns.{name}.unit: {' or '.join(units)}" for name, units in found.items())
 
 
 def other_units(quantity: str) -> dict[str, float]:
