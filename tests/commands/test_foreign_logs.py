@@ -92,7 +92,7 @@ def test_check_and_convert_take_the_map_of_an_experiment_file(
     np.testing.assert_allclose(again.joint_position[:, order], recorded("sway_test").joint_position, rtol=1e-12)
     capsys.readouterr()
     message = refusal(["check", str(path)], tmp_path, capsys)
-    assert "logs.columns of an experiment file, which says what they hold" in message
+    assert "a map of the columns (logs.columns) in an experiment file" in message
 
 
 BAD: list[tuple[dict[str, Any], str]] = [

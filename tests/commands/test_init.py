@@ -155,7 +155,7 @@ def test_nothing_is_ever_replaced_and_nothing_half_written(tmp_path: Path, capsy
         (URDF, log, "nowhere/new.yaml", "--output: no folder"),
         (URDF, log, "new.txt", "--output: '"),
         (URDF, tmp_path / "absent.csv", "a.yaml", "absent.csv: file: no such file"),
-        (URDF, f"{log} + {DEMO.name}/b.csv", "a.yaml", f"looked for from the folder of the first, {DEMO}"),
+        (URDF, f"{log} + {DEMO.name}/b.csv", "a.yaml", f"paths of further files are relative to {DEMO}"),
         (tmp_path / "absent.urdf", log, "a.yaml", "absent.urdf"),
         (URDF, tmp_path / "bad.npz", "a.yaml", "bad.npz: file: cannot be read"),
         (URDF, tmp_path / "x.mcap", "a.yaml", "x.mcap: file: cannot be read (EndOfFile)"),

@@ -211,7 +211,7 @@ def test_matlabs_structures_and_python_objects(tmp_path: Path) -> None:
     rows = [{"t": t, "q": q} for t, q in zip(log.time, log.joint_position, strict=True)]
     np.savez(tmp_path / "y.npz", data=np.array(rows, dtype=object))
     line = refused(lambda: init(URDF, tmp_path / "y.npz", tmp_path / "y.yaml"), str(tmp_path / "y.npz"), LogError)
-    assert "data: Python objects (pickled), references or ragged rows; accepted: plain arrays, one for each" in line
+    assert "data: Python objects (pickled), references or ragged rows; accepted: one plain array per field" in line
 
 
 # -------------------------------------------------------------------------------------------------------------- units

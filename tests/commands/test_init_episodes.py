@@ -110,7 +110,7 @@ def test_groups_of_limbs_are_no_episodes(tmp_path: Path) -> None:
     [
         ("{axis: 0, lengths: n}", "lengths"),
         ("{groups: demo}", "one \\* for the number"),
-        ("{groups: 'demo_*'}", "no such groups"),
+        ("{groups: 'demo_*'}", "no groups 'demo_*'"),
     ],
 )
 def test_episodes_that_a_file_does_not_have_are_refused(tmp_path: Path, entry: str, said: str) -> None:

@@ -109,8 +109,8 @@ def test_a_range_outside_of_the_log_ends_in_one_line(
     assert main([command, *arguments]) == 2
     line = capsys.readouterr().err.strip()
     assert line == (
-        f"torchid: {demo}/first.npz[3:9]: time range: [3:9] of a log that lasts 3 s (300 samples); "
-        "accepted: a part of 0 to 3 s that has samples"
+        f"torchid: {demo}/first.npz[3:9]: time range: [3:9], but the log lasts 3 s (300 samples); "
+        "accepted: a range within 0 to 3 s with samples"
     )
     assert not (tmp_path / "run").exists()
 

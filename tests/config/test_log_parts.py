@@ -85,7 +85,7 @@ def test_the_written_settings_name_the_parts_and_are_read_again(folder: Path) ->
         ({"from": 0}, "logs.train.0.file", "missing; accepted: the name of a log"),
         ({"file": 3}, "logs.train.0.file", "found 3; accepted: the name of a log"),
         ({"file": "a.npz", "from": [1]}, "logs.train.0.from", "found [1]; accepted: seconds"),
-        ({"file": "a.npz", "from": "x"}, "logs.train", "'[x:]' behind its name, and no file of that name"),
+        ({"file": "a.npz", "from": "x"}, "logs.train", "'[x:]' is no range, and no such file exists"),
         ({"file": "a.npz", "fold": 6}, "logs.train.0.fold", "found 6; accepted: a whole number from 1 to 5"),
         ({"file": "a.npz", "fold": 0}, "logs.train.0.fold", "found 0; accepted: a whole number from 1 to 5"),
         ({"file": "a.npz", "fold": 1, "of": 1}, "logs.train.0.of", "found 1; accepted: a whole number from 2"),

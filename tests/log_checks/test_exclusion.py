@@ -148,7 +148,11 @@ def test_a_log_that_is_not_usable_is_refused_in_one_line() -> None:
 @pytest.mark.parametrize(
     ("by", "until", "told"),
     [
-        (0.05, None, r"sway_train.npz: joint_position, step: front_left_knee jumps by 0.0\d+ rad at sample 249-250, .*; split"),
+        (
+            0.05,
+            None,
+            r"sway_train.npz: joint_position, step: front_left_knee jumps by 0.0\d+ rad at sample 249-250, .*; split",
+        ),
         (2.0 * np.pi, None, r"joint_position, wrapped angle: front_left_knee jumps by 6.\d+ rad at sample 249-250, "),
         (0.05, 253, None),
         (0.002, None, None),

@@ -325,7 +325,7 @@ def test_an_arm_on_a_table_that_slants_or_on_a_wall_is_told_so() -> None:
     assert re.match(r"set robot.base_tilt: \[-?1.5708, -?0.0000\]", wall.advice)
 
 
-@pytest.mark.filterwarnings("ignore:.*large part of these accelerations is noise")
+@pytest.mark.filterwarnings("ignore:.*these accelerations are largely noise")
 @pytest.mark.parametrize(("degrees", "told"), [(12.0, True), pytest.param(0.0, False, marks=STUDY)])
 def test_identify_says_that_the_table_of_an_arm_slants(
     tmp_path: object, degrees: float, told: bool, recwarn: pytest.WarningsRecorder

@@ -64,7 +64,7 @@ def test_a_wrench_of_one_contact_needs_no_axis_for_its_name(tmp_path: Path, shap
 @pytest.mark.parametrize("text", ["qpos[7:12]", "qpos[9:]", "qpos[4:4]", "time[0:2]"])
 def test_columns_that_an_array_has_not_are_refused(tmp_path: Path, text: str) -> None:
     columns = Columns(**{**MAP, "joint_position": {"column": text}, "time": {"column": "time"}})  # type: ignore[arg-type]
-    with pytest.raises(LogError, match="columns that it has, counted from 0"):
+    with pytest.raises(LogError, match="existing columns, counted from 0"):
         read_log(saved(tmp_path / "x.npz"), columns=columns)
 
 
@@ -175,7 +175,7 @@ def test_stamps_in_two_columns_are_seconds_and_nanoseconds(tmp_path: Path, name:
     for entry, found in (
         ({"step": 5, "nanoseconds": "stamp.nsec"}, "time: nanoseconds beside step"),
         (time | {"nanoseconds": "stamp.nanosec"}, "time.nanoseconds: unknown name 'stamp.nanosec'|'stamp.nanosec'"),
-        ({"nanoseconds": "stamp.nsec"}, "time: nothing that says where it is"),
+        ({"nanoseconds": "stamp.nsec"}, "time: has no column"),
     ):
         with pytest.raises(InputError, match=found):
             read_log(path, columns=Columns(time=entry, **stated))  # type: ignore[arg-type]

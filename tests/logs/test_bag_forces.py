@@ -121,13 +121,13 @@ def test_contacts_of_every_kind_stand_beside_each_other(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "force", "message"),
     [
-        ("Float32MultiArray", {}, "index: missing, though /foot_forces carries std_msgs/msg/Float32MultiArray; "
-         "accepted: which of its numbers is this contact's, from 0 on"),
-        ("Float32MultiArray", {"index": 3}, "/foot_forces: an array of 3 numbers, without index 3; accepted: an index"),
-        ("Float32MultiArray", {"index": 0, "component": "fz"}, "FL.component: 'fz', though /foot_forces carries"),
-        ("Float32", {"index": 0}, "logs.topics.contact_force_normal.FL.index: 0, though /foot_forces carries std"),
-        ("Float32", {"component": "fx"}, "contact_force_normal.FL.component: 'fx', though /foot_forces carries"),
-        ("Bool", {}, "logs.topics.contact_force_normal.FL: /foot_forces carries std_msgs/msg/Bool; accepted: std_msgs/"
+        ("Float32MultiArray", {}, "index: missing, but /foot_forces has std_msgs/msg/Float32MultiArray; "
+         "accepted: the index of this contact's number, from 0 on"),
+        ("Float32MultiArray", {"index": 3}, "an array of 3 numbers has no index 3; accepted: an index from 0 to 2"),
+        ("Float32MultiArray", {"index": 0, "component": "fz"}, "FL.component: 'fz', but /foot_forces has"),
+        ("Float32", {"index": 0}, "logs.topics.contact_force_normal.FL.index: 0, but /foot_forces has std"),
+        ("Float32", {"component": "fx"}, "contact_force_normal.FL.component: 'fx', but /foot_forces has"),
+        ("Bool", {}, "logs.topics.contact_force_normal.FL: /foot_forces has messages of std_msgs/msg/Bool; accepted: std_msgs/"
          "msg/Float32 or std_msgs/msg/Float64 or std_msgs/msg/Float32MultiArray"),
     ],
 )  # fmt: skip
@@ -143,13 +143,13 @@ def test_what_is_no_force_is_refused_by_name(tmp_path: Path, kind: str, force: d
 
 
 def test_a_contact_needs_something_that_says_when_it_touches(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="contact_force_threshold: missing, though nothing else says when FL touches"):
+    with pytest.raises(ConfigError, match="contact_force_threshold: missing: no contact flags for FL;"):
         read_messages(
             tmp_path / "x.mcap", numbers("Float32", FORCES[:, 0]), contact_force_normal={"FL": "/foot_forces"}
         )
     broken = FORCES[:, 0].copy()
     broken[2] = np.nan
-    with pytest.raises(LogError, match="/foot_forces: a force of NaN in message 2"):
+    with pytest.raises(LogError, match="/foot_forces: the force is NaN in message 2"):
         read_messages(
             tmp_path / "x.mcap",
             numbers("Float64", broken),

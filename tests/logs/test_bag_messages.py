@@ -76,8 +76,8 @@ def test_joints_get_the_names_that_the_map_gives_them(tmp_path: Path) -> None:
     ("names", "found"),
     [
         ({"y": "l_knee"}, "logs.topics.joint_states.names: unknown name 'y'; accepted: x, b, a"),
-        ({"x": "a"}, "names a, b, a, ... that repeat"),
-        ({"x": "k", "b": "k"}, "logs.topics.joint_states.names: two names of 'k'; accepted: each joint of the robot"),
+        ({"x": "a"}, "repeated names: a, b, a, ..."),
+        ({"x": "k", "b": "k"}, "logs.topics.joint_states.names: two names for 'k'; accepted: each joint of the robot"),
     ],
 )
 def test_names_that_no_message_has_or_that_joints_share_are_refused(
@@ -88,7 +88,7 @@ def test_names_that_no_message_has_or_that_joints_share_are_refused(
 
 
 BAD_STATES: list[tuple[list[dict[str, Any]], str]] = [
-    ([{"names": "aa", "position": [1, 2]}], "names a, a, ... that repeat"),
+    ([{"names": "aa", "position": [1, 2]}], "repeated names: a, a, ..."),
     ([{"names": "ab", "position": [1]}], "1 values in 1 messages of 2 names"),
     ([{"names": "ab", "velocity": [1, 2]}], "a message with velocity"),
     ([{"names": "ab"}], "a message with nothing"),
@@ -141,7 +141,7 @@ def test_an_odometry_is_that_of_the_base_link_if_the_map_names_its_frame_and_els
         entries = joints_at(STAMPS) + [("/odom", int(s), ODOMETRY, x) for s, x in zip(STAMPS, said, strict=True)]
         return read_messages(tmp_path / "x.mcap", entries, odometry={"topic": "/odom", "frame": frame})
 
-    meant = r"; logs\.topics\.odometry\.frame says that this is meant$"
+    meant = r"; set logs\.topics\.odometry\.frame to confirm it$"
     with pytest.warns(TorchidWarning, match=f"/odom: frame 'camera', taken to be the robot's base link{meant}"):
         read("camera", None)
     with pytest.warns(TorchidWarning, match=f"/odom: frame '/camera', taken to be 'pelvis'{meant}"):
@@ -187,9 +187,9 @@ def test_the_orientation_of_an_imu_is_the_bases_where_it_is_wanted(tmp_path: Pat
         (unknown, "/imu: no orientation (the first of its covariances is -1)"),
         (
             entries(np.zeros((4, 4))),
-            "/imu: one orientation throughout, [0.0, 0.0, 0.0, 0.0], as of a driver without any",
+            "/imu: always the same orientation [0.0, 0.0, 0.0, 0.0]: the driver does not measure it",
         ),
-        (entries(quats * [[1.0], [1.0], [2.0], [1.0]]), "/imu: a quaternion of the IMU of norm 2"),
+        (entries(quats * [[1.0], [1.0], [2.0], [1.0]]), "/imu: an IMU quaternion has norm 2"),
     ):
         message = refusal(tmp_path / "z.mcap", bad, **wanted)
         assert found in message
@@ -249,7 +249,7 @@ def test_contacts_without_a_wrench_say_themselves_when_they_touch(tmp_path: Path
     assert np.isnan(log.contact_wrench_local[:, 1:]).all()
     nan = [("/w", s, WRENCH, wrench(s, np.full(6, np.nan), "c")) for s in map(int, STAMPS)]
     topics = {"contact_wrenches": {"c": "/w"}, "contact_force_threshold": 5.0}
-    assert "/w: a force of NaN in message 0" in refusal(tmp_path / "x.bag", joints_at(STAMPS) + nan, **topics)
+    assert "/w: the force is NaN in message 0" in refusal(tmp_path / "x.bag", joints_at(STAMPS) + nan, **topics)
 
 
 def test_wrenches_in_a_frame_of_another_name_are_warned_of_unless_that_is_meant(tmp_path: Path) -> None:

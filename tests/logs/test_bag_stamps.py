@@ -49,11 +49,11 @@ def test_receipts_stand_in_for_stamps_that_are_all_zero(tmp_path: Path) -> None:
 
 def test_messages_that_come_twice_count_once_and_contradictions_are_refused(tmp_path: Path) -> None:
     once = joints_at(STAMPS, position=np.arange(4.0))
-    with pytest.warns(TorchidWarning, match="2 messages come twice"):
+    with pytest.warns(TorchidWarning, match="2 duplicate messages are ignored"):
         log = read_messages(tmp_path / "x.bag", [*once, once[2], once[0]])
     np.testing.assert_array_equal(log.joint_position[:, 0], np.arange(4.0))
     other = joints_at(STAMPS[2:3], position=[7.0])
-    assert "different content with one stamp, 102.000000000 s" in refusal(tmp_path / "x.bag", [*once, *other])
+    assert "different messages with the same stamp, 102.000000000 s" in refusal(tmp_path / "x.bag", [*once, *other])
 
 
 def test_time_that_no_two_topics_share_is_refused_with_their_times(tmp_path: Path) -> None:
@@ -142,7 +142,7 @@ def test_gaps_are_not_bridged_and_do_not_matter_outside_of_the_log(tmp_path: Pat
     message = refusal(tmp_path / "x.mcap", states + content, ft_wrenches={"ft": "/w"})
     assert "/w: a gap of 0.5" in message
     assert "median step is 0.01" in message
-    assert "at most 10 median steps: cut the bag there" in message
+    assert "at most 10 median steps; cut the bag there" in message
     for kept in (states[:60], states[105:]):
         log = read_messages(tmp_path / "x.mcap", kept + content, ft_wrenches={"ft": "/w"})
         assert log.ft_wrench is not None
@@ -159,7 +159,10 @@ def test_what_was_not_measured_is_not_interpolated(tmp_path: Path) -> None:
         for s, x in zip(map(int, states), effort, strict=True)
     ]
     entries += [("/imu", s, IMU, imu(s, [0, 0, 9.81], [0, 0, 0])) for s in map(int, every(90, 0.2, 0.8))]
-    with pytest.warns(TorchidWarning, match="/joint_states: NaN in part of joint_torque: NaN throughout"):
+    with pytest.warns(
+        TorchidWarning,
+        match="/joint_states: joint_torque: NaN in some samples; after interpolation all samples are NaN",
+    ):
         log = read_messages(tmp_path / "x.bag", entries, imu="/imu", rate_topic="imu")
     assert log.joint_torque is not None
     assert np.isnan(log.joint_torque).all(axis=0).tolist() == [False, True, True]

@@ -31,7 +31,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         'joint_position: "{joint}_pos"',
         {},
-        "joint_position: no column that fits '{joint}_pos'; accepted: time, q_0, q_1",
+        "joint_position: no column fits '{joint}_pos'; accepted: time, q_0, q_1",
     ),
     (POSITION, {"q_1": None}, "logs.columns.joint_position: 'q_1', no such column; accepted:"),
     (
@@ -62,7 +62,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         POSITION + 'base_quat_wxyz: {column: "k_{axis}", unit: deg}',
         {},
-        "accepted: no unit, as this is a number without",
+        "accepted: no unit: this number has none",
     ),
     (
         QUAT + "{rpy: {columns: {roll: q_0}}}",
@@ -82,20 +82,24 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         'joint_position: {column: "q_{axis}", order: [a]}',
         {},
-        "{axis} in 'q_{axis}'; accepted: at most one each of {joi",
+        "{axis} in 'q_{axis}'; accepted: at most one of each: {joi",
     ),
-    ('joint_position: "{index}_{joint}"', {}, "accepted: at most one each of {joint}, {index}"),
+    ('joint_position: "{index}_{joint}"', {}, "accepted: at most one of each: {joint}, {index}"),
     (
         "joint_position: {order: [a, b]}",
         {},
-        "joint_position: nothing that says where it is; accepted: one of column, co",
+        "joint_position: has no column; accepted: one of column, co",
     ),
     (POSITION + "joint_torque: {column: q_0, pd: {kd: 1}}", {}, "joint_torque: column and pd together; accepted: one"),
-    (POSITION + "joint_torque: {pd: {kp: 1}}", {}, "joint_torque.pd: kp without position; accepted: kp together with"),
+    (
+        POSITION + "joint_torque: {pd: {kp: 1}}",
+        {},
+        "joint_torque.pd: kp without position; accepted: kp and the desired position",
+    ),
     (
         POSITION + "joint_torque: {pd: {kd: 1}}",
         {},
-        "joint_torque.pd.kd: given without joint_velocity; accepted: joint_v",
+        "joint_torque.pd.kd: given without joint_velocity; accepted: a log with joint_v",
     ),
     (
         POSITION + "joint_torque: {pd: {kp: {hip: 3}, position: 'r_{index}'}}",
@@ -107,7 +111,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
         {"r_0": TIME, "r_1": TIME},
         "unknown name 'q'",
     ),
-    (POSITION + "joint_torque: {unit: N mm, pd: {kd: 1}}", {}, "joint_torque: unit beside pd, which it says nothing"),
+    (POSITION + "joint_torque: {unit: N mm, pd: {kd: 1}}", {}, "joint_torque: unit has no effect together with pd"),
     (
         POSITION + "joint_torque: {current: {column: 'r_{index}', torque_constant: {hip: 1}, gear_ratio: 9}}",
         {"r_0": TIME, "r_1": TIME},
@@ -121,13 +125,13 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         POSITION + "joint_torque: {current: {torque_constant: 1, gear_ratio: 9}}",
         {},
-        "joint_torque.current: nothing that says where it is; accepted: one of column, columns",
+        "joint_torque.current: has no column; accepted: one of column, columns",
     ),
     (POSITION + "contact_active: {above: 3}", {}, "contact_active.above: set, without a force; accepted: a column"),
     (
         POSITION + "contact_active: {above: 3, always: [a]}",
         {},
-        "contact_active: above beside always, which it says not",
+        "contact_active: above has no effect together with alw",
     ),
     (
         POSITION + 'contact_force_normal: "f_{contact}"',
@@ -139,9 +143,9 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         POSITION,
         {"joint_position__hip": TIME, "joint_position__knee": TIME},
-        "joint_position: beside 'joint_position.hip'",
+        "joint_position: given twice, also as 'joint_position.hip'",
     ),
-    (POSITION + 'joint_name: "{joint}s_of_{joint}"', {}, "accepted: a pattern with {joint} once, such as {joint}_link"),
+    (POSITION + 'joint_name: "{joint}s_of_{joint}"', {}, "accepted: a pattern with one {joint}, such as {joint}_link"),
     (POSITION, {"q_0": [1, "x", 3]}, "column 'q_0': 'x' in row 3; accepted: numbers, or empty cells"),
     (POSITION, {"q_0": [1, "", 3]}, "joint_position: nan at sample 1, hip; accepted: finite numbers"),
     (POSITION, {"time": None}, "time: missing"),
@@ -163,12 +167,12 @@ BAD_ARRAYS: list[tuple[str, dict[str, Any], str]] = [
     (
         "joint_position: {column: q, order: [a, b, c]}",
         {},
-        "'q': shape (N, 2); accepted: (N, 3), one for each name of its",
+        "'q': shape (N, 2); accepted: (N, 3), one per name of its",
     ),
     (
         "joint_position: {column: q, order: [a]}",
         {},
-        "'q': shape (N, 2); accepted: (N, 1), one for each name of its order",
+        "'q': shape (N, 2); accepted: (N, 1), one per name of its order",
     ),
     (
         "joint_position: q",
@@ -178,7 +182,7 @@ BAD_ARRAYS: list[tuple[str, dict[str, Any], str]] = [
     (ORDER + "joint_position: p", {}, "logs.columns.joint_position: 'p', no such column; accepted: "),
     (ORDER + "joint_position: q", {"q": np.array([["a", "b"]] * 3)}, "'q': values of type <U1; accepted: real numbers"),
     (ORDER + "joint_position: q", {"q": np.array(1.0)}, "'q': a single value"),
-    (ORDER + "joint_position: q", {"q": np.ones((2, 3))}, "'q': shape (N, 3); accepted: (N, 2), one for each name of"),
+    (ORDER + "joint_position: q", {"q": np.ones((2, 3))}, "'q': shape (N, 3); accepted: (N, 2), one per name of"),
     (ORDER + "joint_position: q.T", {"q": np.ones((2, 3, 1))}, "'q.T': a 3-dimensional array; accepted: one of"),
     (ORDER + "joint_position: p.T", {}, "logs.columns.joint_position: 'p.T', no such column; accepted: "),
     (ORDER + "joint_position: \"q['a']\"", {}, "'q['a']': an array of shape (N, 2); accepted: an array of records"),
@@ -240,9 +244,12 @@ def test_without_a_map_unknown_columns_are_named_in_one_line(tmp_path: Path) -> 
     message = refused(
         lambda: read_log(path), f"{path}: columns: 3 unknown: Timestamp, leftKneePos, tau[3]; acc", LogError
     )
-    assert "accepted: names of the log format, or logs.columns of an experiment file" in message
+    assert "accepted: names of the log format, or a map of the columns (logs.columns) in an experiment file" in message
     for name, found in (
-        ("speed", "columns: 1 unknown: speed; accepted: names of the log format, or logs.columns"),
+        (
+            "speed",
+            "columns: 1 unknown: speed; accepted: names of the log format, or a map of the columns (logs.columns)",
+        ),
         ("joint_torqe", "unknown name 'joint_torqe'; accepted: joint_torque"),
     ):
         path = save_csv(tmp_path / "x.csv", {"time": TIME, name: TIME})
@@ -278,9 +285,7 @@ def test_columns_inside_of_others_count(tmp_path: Path) -> None:
 
 def test_a_map_of_another_robot_says_so_and_a_misspelt_name_the_nearest() -> None:
     columns = Columns(joint_order=["LF_HAA", "LF_HFE"])  # type: ignore[arg-type]
-    with pytest.raises(
-        ConfigError, match="none of LF_HAA, LF_HFE is a joint of the robot; is it the one that was recorded"
-    ):
+    with pytest.raises(ConfigError, match="the robot has no joint LF_HAA, LF_HFE. Is it the recorded robot"):
         require_names(columns, {"joint": ["FL_hip", "FL_thigh"]})
     with pytest.raises(UnknownNameError, match="unknown name 'FL_hpi'"):
         require_names(Columns(joint_order=["FL_hpi", "FL_thigh"]), {"joint": ["FL_hip", "FL_thigh"]})  # type: ignore[arg-type]

@@ -79,7 +79,7 @@ def test_names_in_columns_may_be_parts_of_the_urdfs(tmp_path: Path) -> None:
     ordered = mapped(tmp_path, text + "\njoint_order: [knee_joint, hip_joint]", **columns)
     assert ordered.joint_names == ("knee_joint", "hip_joint")
     np.testing.assert_array_equal(ordered.joint_position[0], [4, 1])
-    with pytest.raises(ConfigError, match=r"joint_name: '\{joint\}_joint', which 'knee' is no example of"):
+    with pytest.raises(ConfigError, match=r"joint_name: 'knee' does not fit the pattern '\{joint\}_joint'"):
         mapped(tmp_path, text + "\njoint_order: [knee, hip]", **columns)
 
 

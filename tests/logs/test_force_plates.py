@@ -122,7 +122,7 @@ def test_a_moment_about_an_unknown_point_is_not_known_while_the_foot_is_loaded(t
     moment = value(log.contact_wrench_world)[..., 3:]
     assert np.isnan(moment[sample, 0]).all()
     assert np.isnan(moment).sum() == 3
-    with pytest.warns(TorchidWarning, match="gaps of at most 0.02 s bridged in 1 of 600 samples"):
+    with pytest.warns(TorchidWarning, match="gaps of up to 0.02 s were bridged in 1 of 600 samples"):
         bridged = read_log(tmp_path / "points.npz", bridge_gaps_s=0.02)
     error = value(bridged.contact_wrench_world)[sample, 0, 3:] - moments_about(walk(), np.zeros(3))[sample, 0]
     assert np.abs(error).max() < 1.0  # of a spline through moments of 100 N m

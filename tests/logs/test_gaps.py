@@ -37,7 +37,7 @@ def test_a_spline_fills_gaps_up_to_the_length_between_the_values_beside_them() -
     broken = exact.copy()
     broken[50:54, 0] = np.nan  # 0.05 s from value to value
     broken[90:95, 1] = np.nan  # 0.06 s
-    with pytest.warns(TorchidWarning, match=r"^joint_position: gaps of at most 0.05 s bridged in 4 of 200 samples$"):
+    with pytest.warns(TorchidWarning, match=r"^joint_position: gaps of up to 0.05 s were bridged in 4 of 200 samples$"):
         found = bridged(0.05, joint_position=broken)["joint_position"]
     assert np.abs(found[:, 0] - exact[:, 0]).max() < 2e-5
     assert np.array_equal(found[:, 1], broken[:, 1], equal_nan=True)
@@ -116,15 +116,18 @@ def test_a_refusal_names_the_key_and_the_longest_gap(tmp_path: Path) -> None:
     broken = signal(1.0) * gap(slice(20, 22), slice(50, 58))
     path = written(tmp_path / "a.npz", broken)
     message = log_refusal(path)
-    assert "joint_position: nan at sample 20, hip; accepted: finite numbers, or gaps that preprocessing.brid" in message
-    assert "(the longest here takes 0.09 s)" in message
+    assert (
+        "joint_position: nan at sample 20, hip; accepted: finite numbers, or preprocessing.bridge_gaps_s to brid"
+        in message
+    )
+    assert "(the longest is 0.09 s)" in message
     with pytest.warns(TorchidWarning, match="2 of 200"), pytest.raises(LogError, match="nan at sample 50, hip"):
         read_log(path, bridge_gaps_s=0.05)
     with pytest.warns(TorchidWarning, match="10 of 200"):
         log: Log = read_log(path, bridge_gaps_s=0.09)
     assert np.abs(log.joint_position[:, 0] - signal(1.0)).max() < 1e-3
     at_end = written(tmp_path / "b.npz", signal(1.0) * gap(slice(0, 3)))
-    assert "none here has values on both sides" in log_refusal(at_end)
+    assert "no gap has values on both sides" in log_refusal(at_end)
 
 
 @pytest.mark.parametrize("value", [np.inf, 1e300, -np.inf])

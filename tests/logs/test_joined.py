@@ -118,7 +118,7 @@ def test_a_shift_is_added_to_the_stamps_of_its_file(log: Log, tmp_path: Path) ->
     write_fields(tmp_path / "rest.npz", replace(log, time=log.time + 12.5), "joint_torque", *CONTACTS)
     same(read_log(tmp_path / "motion.npz + rest.npz@-12.5s"), log)
     message = log_refusal(tmp_path / "motion.npz + rest.npz")
-    assert "time: no stamp of motion.npz that all files cover: rest.npz starts at 12.5" in message
+    assert "time: no time that all files share with motion.npz: rest.npz starts at 12.5" in message
     assert "motion.npz ends at 3.99" in message
     assert "shift_s" in message
     same(read_log(tmp_path / "motion.npz@12.5 + rest.npz"), replace(log, time=log.time + 12.5))
@@ -191,7 +191,7 @@ def test_a_field_in_two_files_is_refused_by_name(log: Log, tmp_path: Path) -> No
     write_fields(tmp_path / "a.npz", log, *MOTION, "joint_torque")
     write_fields(tmp_path / "b.npz", log, "joint_torque")
     message = log_refusal(tmp_path / "a.npz + b.npz")
-    assert "joint_torque: both in a.npz and in b.npz; accepted: every field but time in one of" in message
+    assert "joint_torque: in a.npz and in b.npz; accepted: each field in one file only, or with" in message
     assert "base_quat_wxyz" not in message
     assert log.base_quat_xyzw is not None
     np.savez(tmp_path / "b.npz", time=log.time, base_quat_wxyz=np.roll(log.base_quat_xyzw, 1, axis=1))
@@ -218,7 +218,7 @@ def test_files_that_make_up_no_log_are_refused_in_one_line(log: Log, tmp_path: P
         "motion.npz + timeless.npz": "timeless.npz: time: missing; accepted: stamps in each",
         "motion.npz + short.npz": "short.npz: joint_torque: shape",
         "motion.npz + foreign.npz": "foreign.npz: ",
-        "torques.npz + motion.npz[9:]": "time range: [9:] of a log that lasts 4 s",
+        "torques.npz + motion.npz[9:]": "time range: [9:], but the log lasts 4 s",
         "motion.npz + walk.mcap": "walk.mcap: file: a bag, one of several files",
         "motion.npz + torques.wav": "torques.wav: file: extension '.wav'",
     }
@@ -239,10 +239,12 @@ def test_gaps_of_a_file_that_is_interpolated_are_named_and_bridged(log: Log, tmp
     write_fields(tmp_path / "motion.npz", log, *MOTION)
     np.savez(tmp_path / "torques.npz", time=other, joint_names=log.joint_names, joint_torque=torque)
     name = tmp_path / "motion.npz + torques.npz"
-    with pytest.warns(TorchidWarning, match="joint_torque: NaN in part of it: NaN throughout after interpolation"):
+    with pytest.warns(
+        TorchidWarning, match="joint_torque: NaN in some samples; after interpolation all samples are NaN"
+    ):
         lost = read_log(name)
     assert np.isnan(lost.joint_torque).all(axis=0).tolist() == [k == 4 for k in range(12)]
-    with pytest.warns(TorchidWarning, match=r"torques.npz: joint_torque: gaps of at most 0.01 s bridged in 3 of 4000"):
+    with pytest.warns(TorchidWarning, match="torques.npz: joint_torque: gaps of up to 0.01 s were bridged in 3 of"):
         found = read_log(name, bridge_gaps_s=0.01)
     assert np.abs(found.joint_torque - np.sin(found.time[:, None] + np.arange(12.0))).max() < 1e-9
     np.savez(tmp_path / "torques.npz", time=np.where(other < 2.0, other, other + 0.05), joint_torque=np.sin(torque))
@@ -335,7 +337,7 @@ def test_arrays_of_one_file_that_have_stamps_of_their_own_are_those_of_two_files
             np.testing.assert_array_equal(getattr(found, name), x, err_msg=name)
         assert np.abs(found.imu_specific_force - np.sin(7.0 * found.time[:, None] + np.arange(3))).max() < 1e-9
     with (
-        pytest.raises(LogError, match="stamps beside those of time \\('imu/stamp_us'\\), read whole"),
+        pytest.raises(LogError, match="a file with stamps 'imu/stamp_us' must fit into memory"),
         open_log_blocks(tmp_path / "one.npz", tmp_path, columns),
     ):
         pass

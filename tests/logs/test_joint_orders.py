@@ -120,7 +120,7 @@ def test_a_file_with_a_name_is_dumped_and_read_as_its_list(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("order", "message"),
     [
-        ("g1", "logs.columns.joint_order: 'g1', whose joint 'left_hip_pitch_joint' the robot has not; accepted: go2"),
+        ("g1", "logs.columns.joint_order: 'g1' has a joint 'left_hip_pitch_joint', your robot has not; accepted: go2"),
         ("go3", "logs.columns.joint_order: found 'go3'; accepted: a list of names, or a robot: go2, b2, a1, "),
         (["FR_hip"], "logs.columns.joint_order: unknown name 'FR_hip'; accepted: FR_hip_joint"),
     ],
@@ -136,10 +136,10 @@ def test_an_order_of_another_robot_is_refused(
 @pytest.mark.parametrize(
     ("urdf", "low_state", "message"),
     [
-        (URDF, {"robot": "h1"}, "robot: 'h1', whose joint 'right_hip_roll_joint' the robot has not; accepted: go2, "),
-        (ROBOTS / G1, {"robot": "go2"}, "robot: 'go2', whose joint 'FR_hip_joint' the robot has not; accepted: g1, g"),
+        (URDF, {"robot": "h1"}, "robot: 'h1' has a joint 'right_hip_roll_joint', your robot has not; accepted: go2, "),
+        (ROBOTS / G1, {"robot": "go2"}, "robot: 'go2' has a joint 'FR_hip_joint', your robot has not; accepted: g1, g"),
         (URDF, {"joints": ["FR_hip"]}, "low_state.joints: unknown name 'FR_hip'; accepted: FR_hip_joint"),
-        (ROBOTS / "panda_description/urdf/panda.urdf", {"robot": "go2"}, "names of joints by number, as no"),
+        (ROBOTS / "panda_description/urdf/panda.urdf", {"robot": "go2"}, "joint names by number: no known robot"),
     ],
 )  # fmt: skip
 def test_a_state_of_a_robot_that_is_not_the_urdfs_is_refused(

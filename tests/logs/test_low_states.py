@@ -79,7 +79,7 @@ def test_the_quaternion_of_the_imu_is_the_bases_orientation_where_it_is_set(tmp_
     for constant in ([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]):
         assert read_with(np.tile(constant, (len(log), 1))).base_quat_xyzw is None
     wxyz[7] = 0.0
-    message = refused(lambda: read_with(wxyz), f"{tmp_path / 'x.mcap'}: {TOPIC}: a quaternion of the IMU of norm 0")
+    message = refused(lambda: read_with(wxyz), f"{tmp_path / 'x.mcap'}: {TOPIC}: an IMU quaternion has norm 0")
     assert message.endswith("accepted: unit quaternions, or logs.topics.low_state.orientation: false")
 
 
@@ -129,7 +129,7 @@ def test_flags_of_others_stand_beside_counts_that_are_forces(tmp_path: Path) -> 
     assert log.contact_active.all()
     np.testing.assert_array_equal(log.contact_force_normal, COUNTS)
     message = refused(
-        lambda: read_log(path, parsed(topics)), f"{path}: logs.topics.low_state.above: missing, though noth"
+        lambda: read_log(path, parsed(topics)), f"{path}: logs.topics.low_state.above: missing: no contact flags for"
     )
     assert "when FR_foot touches" in message
     bare = read_log(path, parsed(topics | {"contact_force_threshold": 3.0}), needs_flags=False)
@@ -146,7 +146,7 @@ def test_stamps_are_the_robots_milliseconds_however_late_messages_come(tmp_path:
     again = of(tmp_path / "x.mcap", log, options={"late": late})
     np.testing.assert_array_equal(again.time, log.time)
     np.testing.assert_array_equal(again.joint_position, log.joint_position)
-    with pytest.warns(TorchidWarning, match="no stamps in the messages: the log takes the times of receipt"):
+    with pytest.warns(TorchidWarning, match="the messages have no stamps; the log uses times of receipt"):
         uneven = read(tmp_path / "x.mcap", robot="go2", stamps="receipt")
     assert np.abs(np.diff(uneven.time) - 0.002).max() > 5e-4
 
@@ -162,7 +162,7 @@ def test_a_counter_that_starts_again_from_0_goes_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize("tick", [0, 1])
 def test_without_ticks_the_times_of_receipt_count_with_a_warning(tmp_path: Path, tick: int) -> None:
     log = moving(GO2, 4)
-    with pytest.warns(TorchidWarning, match=f"{TOPIC}: no stamps in the messages"):
+    with pytest.warns(TorchidWarning, match=f"{TOPIC}: the messages have no stamps"):
         again = of(tmp_path / "x.mcap", log, options={"ticks": np.full(4, tick)})
     np.testing.assert_array_equal(again.time, log.time)
 
@@ -183,13 +183,13 @@ def test_a_tick_that_comes_twice_counts_once_or_is_refused(tmp_path: Path) -> No
     log = moving(GO2, 4)
     entries = list(low_states(log, GO2))
     entries.insert(2, entries[1])
-    with pytest.warns(TorchidWarning, match="1 messages come twice"):
+    with pytest.warns(TorchidWarning, match="1 duplicate messages are ignored"):
         assert len(read(write(tmp_path / "x.mcap", entries), robot="go2")) == 4
     ticks = {"ticks": np.array([1000, 1002, 1002, 1006])}
     message = refused(
         lambda: of(tmp_path / "y.mcap", log, options=ticks), f"{tmp_path}/y.mcap: {TOPIC}: messages of diff"
     )
-    assert "every stamp once, or logs.topics.low_state.stamps: receipt" in message
+    assert "different stamps, or logs.topics.low_state.stamps: receipt" in message
 
 
 def test_other_topics_are_aligned_by_the_usual_lateness_of_messages(tmp_path: Path) -> None:
@@ -215,8 +215,8 @@ def test_other_topics_are_aligned_by_the_usual_lateness_of_messages(tmp_path: Pa
 def test_a_state_of_another_robot_is_refused_with_the_nearest(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     cases: list[tuple[str, str, str]] = [
-        ("g1", "go2", "logs.topics.low_state.robot: 'go2', which sends unitree_go/msg/LowState, though /lowstate "
-         "carries unitree_hg/msg/LowState; accepted: g1, g1_23dof"),
+        ("g1", "go2", "logs.topics.low_state.robot: 'go2' sends unitree_go/msg/LowState, but /lowstate "
+         "has unitree_hg/msg/LowState; accepted: g1, g1_23dof"),
     ]  # fmt: skip
     for sent, stated, message in cases:
         order = JOINT_ORDERS[sent]
@@ -229,7 +229,7 @@ def test_ankles_by_their_parallel_motors_are_refused(tmp_path: Path) -> None:
     message = refused(
         lambda: of(tmp_path / "x.mcap", moving(G1_JOINTS), "g1", HG, options), f"{tmp_path}/x.mcap: {TOPIC}: m"
     )
-    assert "mode_pr 1: ankles and waist by their parallel motors (A, B), not by joint; accepted: messages w" in message
+    assert "mode_pr 1: ankles and waist by parallel motors (A, B), not by joint; accepted: messages w" in message
 
 
 MAPS: list[tuple[dict[str, Any], str]] = [
@@ -239,12 +239,15 @@ MAPS: list[tuple[dict[str, Any], str]] = [
     ),
     ({"robot": "go2", "joints": ["a"]}, "logs.topics.low_state: robot and joints together; accepted: one of the two"),
     ({"robot": "g2"}, "logs.topics.low_state.robot: unknown name 'g2'; accepted: go2, g1, b2"),
-    ({"joints": ["a", "a"]}, "logs.topics.low_state.joints: 'a' twice; accepted: every name once, null for what is"),
+    ({"joints": ["a", "a"]}, "logs.topics.low_state.joints: 'a' twice; accepted: every name once; null for an unused"),
     ({"joints": [None]}, "logs.topics.low_state.joints: no name; accepted: every name once"),
-    ({"joints": [*map(str, range(21))]}, "low_state.joints: 21 names, though unitree_go/msg/LowState has 20 motors"),
-    ({"robot": "go2", "feet": ["a"]}, "low_state.feet: given, though nothing reads them; accepted: above, the reading"),
-    ({"robot": "g1", "above": 5}, "low_state.robot: 'g1', which sends unitree_hg/msg/LowState without foot sensors, "),
-    ({"robot": "h1", "above": 5}, "low_state.feet: missing, though the foot sensors are read; accepted: contacts by"),
+    ({"joints": [*map(str, range(21))]}, "low_state.joints: 21 names, but unitree_go/msg/LowState has 20 motors"),
+    (
+        {"robot": "go2", "feet": ["a"]},
+        "low_state.feet: given, but above and forces are missing; accepted: above (the",
+    ),
+    ({"robot": "g1", "above": 5}, "low_state.robot: 'g1' sends unitree_hg/msg/LowState without foot sensors, but "),
+    ({"robot": "h1", "above": 5}, "low_state.feet: missing, but foot sensors are read; accepted: contacts by"),
     ({"robot": "go2", "above": 5, "feet": ["a", "a"]}, "low_state.feet: 'a' twice; accepted: every name once"),
 ]
 
@@ -266,7 +269,7 @@ def test_topics_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
         ({"imu": "/imu"}, "logs.topics.imu: set beside logs.topics.low_state.frame; accepted: one IMU"),
         (
             {"contact_force_normal": {"FL_foot": "/f"}},
-            "contact_force_normal.FL_foot: set, though logs.topics.low_stat",
+            "contact_force_normal.FL_foot: set together with logs.topics.low_stat",
         ),
         ({"rate_topic": "joint_states"}, "logs.topics.rate_topic: unknown name 'joint_states'; accepted: low_state"),
     ):
@@ -276,10 +279,10 @@ def test_topics_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
     message = refused(
         lambda: read(humanoid, joints=G1_JOINTS, above=3, feet=["a"]), f"{humanoid}: logs.topics.low_state.above: "
     )
-    assert "set, though unitree_hg/msg/LowState has no foot sensors; accepted: no above" in message
+    assert "set, but unitree_hg/msg/LowState has no foot sensors; accepted: no above" in message
     message = refused(lambda: read_log(path, parsed({"joint_states": TOPIC})), f"{path}: logs.topics.joint_states: ")
     assert (
-        "/lowstate carries unitree_go/msg/LowState; accepted: sensor_msgs/msg/JointState, or logs.topics.low_"
+        "/lowstate has messages of unitree_go/msg/LowState; accepted: sensor_msgs/msg/JointState, or logs.topics.low_"
         in message
     )
 

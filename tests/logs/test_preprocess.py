@@ -201,7 +201,7 @@ def test_cutoffs_outside_zero_to_nyquist_are_refused(wrong: Any) -> None:
 
 
 def test_a_cutoff_that_no_stamps_in_ms_allow_is_answered_with_the_unit() -> None:
-    with pytest.raises(InputError, match=r"cutoff_hz: 8.0; .*below 0.25 Hz, .*\(steps of 2 s: are the stamps in s\?\)"):
+    with pytest.raises(InputError, match=r"cutoff_hz: 8.0; .*below 0.25 Hz, .*steps of 2 s: are stamps in seconds\?\)"):
         preprocess(sine_log(1.0, 1e3 * uniform()), cutoff_hz=8.0)
     with pytest.raises(InputError, match="median sample rate$"):
         preprocess(sine_log(1.0, uniform()), cutoff_hz=300.0)

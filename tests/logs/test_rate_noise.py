@@ -54,7 +54,7 @@ def test_the_cutoff_that_is_proposed_is_low_enough() -> None:
 
 def test_without_a_filter_one_is_proposed_and_recorded_or_clean_accelerations_are_left_alone() -> None:
     log = swinging(SIGMA, (0.5,))
-    assert "accepted: a low-pass filter, preprocessing.cutoff_hz" in said(log)
+    assert "set preprocessing.cutoff_hz (a low-pass filter)" in said(log)
     assert said(swinging(0.0, (0.5,)), cutoff_hz=20.0) == ""
     rates = {name: np.zeros_like(log.joint_position) for name in ("joint_velocity", "joint_acceleration")}
     assert said(replace(log, **rates), cutoff_hz=20.0) == ""

@@ -35,7 +35,7 @@ def test_rows_may_be_in_any_order_and_one_that_is_missing_was_not_measured(tmp_p
 
 
 def test_a_row_that_is_there_twice_counts_once_and_two_that_differ_are_refused(tmp_path: Path) -> None:
-    with pytest.warns(TorchidWarning, match="1 row of a joint and stamp that have one already"):
+    with pytest.warns(TorchidWarning, match="1 row with the same joint and stamp as another: ignored"):
         log = read_log(written(tmp_path / "x.csv", ROWS + "0.1,b,4,x\n"), columns=COLUMNS)
     np.testing.assert_array_equal(log.joint_position, [[1, 2], [3, 4]])
     with pytest.raises(LogError, match=r"column 'joint': two rows of 'b' at 0\.1, with two of 'q'"):
@@ -50,7 +50,7 @@ def test_a_row_that_is_there_twice_counts_once_and_two_that_differ_are_refused(t
             Columns(rows_of="motor", time="t"),
             "logs.columns.rows_of: no column 'motor'; accepted: one of t, joint",
         ),
-        (ROWS, Columns(rows_of="joint"), "logs.columns.rows_of: no column of stamps beside 'joint'"),
+        (ROWS, Columns(rows_of="joint"), "logs.columns.rows_of: no column of stamps; accepted"),
         (ROWS.replace(",b,2", ",,2"), COLUMNS, "logs.columns.rows_of: an empty cell; accepted: a name in each row"),
     ],
 )
@@ -62,9 +62,9 @@ def test_rows_without_names_or_stamps_are_refused(tmp_path: Path, text: str, col
 
 def test_stamps_that_begin_anew_are_said_to_be_those_of_another_recording(tmp_path: Path) -> None:
     episodes = written(tmp_path / "x.csv", "time,joint_position.a\n0,1\n1,2\n0,3\n")
-    assert "of recordings one after the other (episodes) the name with [#0] for the first" in log_refusal(episodes)
+    assert "for several recordings (episodes) add [#0] or [#0:8] to the file name" in log_refusal(episodes)
     coarse = written(tmp_path / "y.csv", "time,joint_position.a\n0,1\n0,2\n1,3\n")
-    assert "where rows are steps of a clock that stamps round, logs.columns.time: {step: ...}" in log_refusal(coarse)
+    assert "for a constant step set logs.columns.time: {step: ...}" in log_refusal(coarse)
 
 
 TIMES, ANGLES = [0.0, 0.1, 0.2, 0.3], [[0.1, 1.0], [0.2, 2.0], [None, None], [0.4, 4.0]]
@@ -102,7 +102,7 @@ def test_documents_of_json_are_read_as_arrays(tmp_path: Path, kind: str) -> None
     ("text", "found"),
     [
         ('{"time": [0, 1', "cannot be read (JSONDecodeError"),
-        ("[1, 2]", "a list, no object of arrays and no list of records"),
+        ("[1, 2]", "found a list, not an object of arrays or a list of records"),
         (
             '{"time": [0, 1], "joint_position": [[1], [1, 2]], "joint_names": ["a"]}',
             "Python objects (pickled), references",

@@ -47,7 +47,7 @@ def test_remarks_around_the_names_change_nothing(tmp_path: Path, head: str) -> N
 def test_lines_between_the_names_and_the_rows_are_refused(tmp_path: Path) -> None:
     for line in ("s,deg,N mm", "a,b,c", "x,y,z"):
         found = log_refusal(written(tmp_path / "x.csv", f"time,q,tau\n{line}\n{PLAIN}"))
-        assert f"line 2: '{line}' between the names and the first row; accepted: rows of numbers below the" in found
+        assert f"line 2: '{line}' between the names and the first row; accepted: rows of numbers directly" in found
 
 
 def test_spaces_separate_cells_where_nothing_else_does(tmp_path: Path) -> None:
@@ -65,7 +65,10 @@ def test_a_separator_at_the_end_of_rows_is_no_column(tmp_path: Path, of_names: s
 
 def test_rows_without_names_need_a_map(tmp_path: Path) -> None:
     found = log_refusal(written(tmp_path / "x.csv", PLAIN))
-    assert "columns: 3 of numbers without a line of names; accepted: names of the log format, or logs.columns" in found
+    assert (
+        "columns: 3 columns of numbers without a line of names; accepted: names of the log format, or a map of the"
+        in found
+    )
     given = Columns(time="column_0", joint_position={"columns": {"a": "column_1"}}, ignore=["*"])  # type: ignore[arg-type]
     np.testing.assert_array_equal(read_log(tmp_path / "x.csv", columns=given).joint_position[:1], [[1.5]])
 

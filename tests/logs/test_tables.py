@@ -109,8 +109,8 @@ BAD: list[tuple[dict[str, Any], str, str]] = [
     ({"contact_active__sole": None}, "contact_wrench_local", "given without contact_active"),
     ({"imu_frame": None}, "imu_", "given without imu_frame"),
     ({"joint_position__knee [deg]": [1.0] * 3}, "joint_position.knee [deg];", "1 unknown"),
-    ({"base_position_world__x(mm)": [1.0] * 3}, "x(mm)'", "no such part of this field"),
-    ({"imu_frame": ["a", "a", "b"]}, "imu_frame", "'a' and 'b'; accepted: one name, the same in every row"),
+    ({"base_position_world__x(mm)": [1.0] * 3}, "x(mm)'", "this field has no such component"),
+    ({"imu_frame": ["a", "a", "b"]}, "imu_frame", "'a' and 'b'; accepted: the same name in every row"),
     ({"imu_frame": ["a", None, "a"]}, "imu_frame", "'a' and an empty cell"),
     ({"time": [0.0, 0.1, 0.1]}, "time", "0.1 at sample 2, after 0.1 at sample 1"),
     ({"time": [0.0, None, 0.1]}, "time", "nan at sample 1"),
@@ -158,7 +158,7 @@ def test_semicolons_tabs_and_decimal_commas_are_recognised(tmp_path: Path, separ
 def test_two_decimal_marks_in_a_file_are_refused_by_row(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text("time;joint_position.a\n0,0;1,5\n0,1;2.5\n")
     assert (
-        "column 'joint_position.a': '2.5' in row 3; accepted: numbers, or empty cells where nothing was"
+        "column 'joint_position.a': '2.5' in row 3; accepted: numbers, or empty cells for missing values"
         in log_refusal(tmp_path / "x.csv")
     )
     (tmp_path / "y.csv").write_text("time;joint_position.a\n0,0;1,5\n0,1;1.002,5\n")
@@ -175,10 +175,10 @@ def test_quoted_names_with_other_separators_in_them_stay_names(tmp_path: Path) -
 def test_rows_of_other_lengths_and_repeated_columns_are_refused(tmp_path: Path) -> None:
     whole = save(tmp_path / "x.csv", columns()).read_text()
     for text, found in (
-        (whole + "1,2\n", "2 cells; accepted: 19 cells, as there are names"),
+        (whole + "1,2\n", "2 cells; accepted: 19 cells, as in the line of names"),
         (whole.replace("imu_frame", "time"), "column 'time': given twice"),
         (whole.replace("time", "t\xefme", 1).encode("latin-1"), "'t\xefme'"),
-        (whole.encode("utf-16"), "header: bytes that are no letters"),
+        (whole.encode("utf-16"), "header: bytes that are not text"),
         (whole.split("\n")[0], "time: no samples"),
         (whole.split("\n")[0] + "\n\n\n", "time: no samples"),
         ("", "header: an empty line"),
@@ -267,7 +267,7 @@ def test_rows_that_repeat_the_one_before_count_once(tmp_path: Path, suffix: str,
     path = save(tmp_path / f"x{suffix}", twice)
     if suffix == ".parquet":
         pq.write_table(pq.read_table(path), path, row_group_size=rows)
-    with pytest.warns(TorchidWarning, match="3 rows like the one before, stamp and all: counted once"):
+    with pytest.warns(TorchidWarning, match="3 rows equal to the previous one, including the stamp: ignored"):
         log = read_log(path)
     expected = read_log(save(tmp_path / f"once{suffix}", once)).arrays()
     for name, values in log.arrays().items():

@@ -76,7 +76,7 @@ def test_brackets_that_hold_no_range_are_refused_in_one_line(tmp_path: Path, tex
     with pytest.raises(LogError) as raised:
         split_range(tmp_path / f"walk.npz{text}")
     line = str(raised.value)
-    assert line.startswith(f"{tmp_path}/walk.npz{text}: time range: '{text}' behind its name")
+    assert line.startswith(f"{tmp_path}/walk.npz{text}: time range: '{text}' is no range")
     assert "accepted: [START:END]" in line
     assert "\n" not in line
 
@@ -179,12 +179,10 @@ def test_recordings_one_after_the_other_are_as_in_files_of_their_own(
         assert_equal(read_log(name), expected := read_log(tmp_path / "alone.npz"))
         with open_log_blocks(Path(name), tmp_path) as blocks:
             assert_equal(blocks.read(slice(0, len(expected))), expected)
-    with pytest.raises(
-        LogError, match=r"recording: \[#3\] of a file in which stamps begin 3 times; accepted: \[#0\] to"
-    ):
+    with pytest.raises(LogError, match=r"recording: \[#3\], but the file has 3 recordings; accepted: \[#0\] to"):
         read_log(f"{path}[#3]")
     for name in (str(path), f"{path}[:80%]"):
-        with pytest.raises(LogError, match=r"at sample 40, after .* the name with \[#0\] for the first, or \[#0:8\]"):
+        with pytest.raises(LogError, match=r"at sample 40, after .* add \[#0\] or \[#0:8\] to the file name"):
             read_log(name)
     one, other = split_range(f"{path}[#1]").range, split_range(f"{path}[#2]").range
     assert (share_samples(one, one), share_samples(one, other), share_samples(one, None)) == (True, False, True)

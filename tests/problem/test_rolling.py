@@ -114,9 +114,9 @@ def test_normals_come_back_from_every_format_and_in_the_order_of_the_contacts(tm
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        (lambda n: n * 1.01, "norm 1.01 at sample 3, LH_FOOT, while in contact; accepted: unit vectors, to 0.001"),
-        (lambda n: n * np.nan, "norm nan at sample 3, LH_FOOT, while in contact; accepted: unit vectors, to 0.001"),
-        (lambda n: n * 0.0, "norm 0 at sample 3, LH_FOOT, while in contact; accepted: unit vectors, to 0.001"),
+        (lambda n: n * 1.01, "norm 1.01 at sample 3, LH_FOOT, while in contact; accepted: unit vectors, within 0.001"),
+        (lambda n: n * np.nan, "norm nan at sample 3, LH_FOOT, while in contact; accepted: unit vectors, within 0.001"),
+        (lambda n: n * 0.0, "norm 0 at sample 3, LH_FOOT, while in contact; accepted: unit vectors, within 0.001"),
         (lambda n: n * np.inf, "at sample 3, LH_FOOT x; accepted: finite numbers, or NaN"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Series with stamps of their own at the common stamps of a log: topics of a bag, files of one recording."""
+"""Align series with different stamps: topics of a bag, or files of one recording."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ from torchid.logs.timeline import JITTER, LONGEST_STEP, spline_derivatives
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Fields of a log (K, ...) with stamps (K,) [s], strictly increasing, counted as those of the log.
+    """Fields of a log (K, ...) with stamps (K,) [s], strictly increasing, in the log's clock.
 
-    `name`: of the topic, "" for what messages name already. `whole`: what it is a part of, "bag" or "file".
+    `name`: of the topic, "" if messages name it already. `whole`: "bag" or "file", for messages.
     """
 
     name: str
@@ -68,13 +68,13 @@ class Series:
         return f"{self.name}: {field}" if self.name else field
 
     def at(self, time: FloatArray) -> dict[str, FloatArray]:
-        """The fields at stamps (N,) [s] that the series covers: unchanged for equal stamps, else by a quintic spline.
+        """The fields at stamps (N,) [s] within the series: unchanged at equal stamps, else from a quintic spline.
 
-        Quaternions are interpolated as in `preprocess`, component by component without sign flips, then normalised.
-        A channel with any NaN becomes NaN throughout.
+        Quaternions are interpolated as in `preprocess`: by component without sign flips, then normalised.
+        A channel with any NaN becomes NaN in all samples.
 
         Raises:
-            LogError: too long a gap in a series that must be interpolated.
+            LogError: the series must be interpolated, and has a gap that is too long.
 
         Warns:
             TorchidWarning: a field is NaN in some samples.
@@ -90,7 +90,7 @@ class Series:
         return np.asarray(values[np.searchsorted(self.stamps, time + stamp_slack(time), side="right") - 1])
 
     def same_stamps(self, time: FloatArray) -> slice | None:
-        """The samples that have the stamps (N,) [s]; None where others are needed."""
+        """The samples at the stamps (N,) [s]; None if some stamps have no sample."""
         slack = stamp_slack(time)
         first = int(np.searchsorted(self.stamps, time[0] - slack))
         last = int(np.searchsorted(self.stamps, time[-1] + slack, side="right"))
@@ -99,16 +99,16 @@ class Series:
         return slice(first, last) if same else None
 
     def _unbroken(self, time: FloatArray) -> slice:
-        """The samples around the log's time, checked for gaps that are too long to be interpolated."""
+        """The samples around the log's time; LogError if a gap is too long for interpolation."""
         segments = list(unbroken_segments(self.stamps))
         starts = self.stamps[[segment.start for segment in segments]]
         number = max(int(np.searchsorted(starts, time[0], side="right")) - 1, 0)
         run = segments[number]
         if number + 1 < len(segments) and self.stamps[run.stop - 1] < time[-1]:
             before, after = self.stamps[[run.stop - 1, run.stop]]
-            reason = f"a gap of {after - before:.4g} s from {before:.4g} s on, "
-            reason += f"where the median step is {np.median(np.diff(self.stamps)):.4g} s"
-            accepted = f"steps of at most {LONGEST_STEP:g} median steps: cut the {self.whole} there"
+            reason = f"a gap of {after - before:.4g} s after {before:.4g} s (median step"
+            reason += f" {np.median(np.diff(self.stamps)):.4g} s)"
+            accepted = f"gaps of at most {LONGEST_STEP:g} median steps; cut the {self.whole} there"
             raise LogError.at_field(self.name or "time", reason, accepted)
         return run
 
@@ -121,15 +121,14 @@ class Series:
             return np.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True))
         gaps = np.isnan(values).any(axis=0)
         if gaps.any() and not np.isnan(values[:, gaps]).all():
-            where = f"{self.name}: NaN in part of {name}" if self.name else f"{name}: NaN in part of it"
-            warn_about_file(f"{where}: NaN throughout after interpolation")
+            warn_about_file(f"{self._field(name)}: NaN in some samples; after interpolation all samples are NaN")
         out = np.full((len(time), *values.shape[1:]), np.nan)
         out[:, ~gaps] = spline_derivatives(stamps, values[:, ~gaps], time, (0,))[0]
         return out
 
 
 def stamp_slack(time: FloatArray) -> float:
-    """By how much two stamps may differ [s] that are one, but for rounding."""
+    """The largest difference [s] of two stamps that count as equal."""
     return JITTER * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
 
 
@@ -141,15 +140,15 @@ _HELD = ("contact_active", NORMALS)
 def read_joined(
     files: Sequence[LogFile], columns: Columns | None, read: Callable[[Path, Columns | None], Fields]
 ) -> Fields:
-    """The fields of a log in several files: at the stamps of the first, within the time that all of them cover.
+    """Read a log from several files: at the stamps of the first, within the time that all of them cover.
 
     Args:
         files: each with other fields. Names of joints, contacts and sensors may have another order in each.
-        columns: what their columns hold; an entry is for those files that have a column of it.
-        read: the fields of one file, with a map of its own.
+        columns: the map of columns; each entry applies to the files that have its columns.
+        read: reads the fields of one file with its part of the map.
 
     Raises:
-        LogError: a field in two files, names that differ, files without a common time, or too long a gap in one.
+        LogError: a field is in two files, names differ, the files have no common time, or a gap is too long.
     """
     maps = _maps([file.path for file in files], columns)
     parts = []
@@ -160,14 +159,14 @@ def read_joined(
 
 
 def align_by_stamps(raw: Fields, sources: Mapping[str, Sequence[str]], others: Mapping[str, FloatArray]) -> Fields:
-    """The fields of a file of which some have stamps of their own: all at those of `time`, within what all cover.
+    """Align the fields of a file with several arrays of stamps to those of `time`, within the time that all cover.
 
-    A field has the stamps that are as many as its samples, of several those that `own_stamps` says.
+    A field belongs to the array of stamps with as many samples; `own_stamps` decides between several.
 
     Args:
         raw: fields of the file, `time` among them.
-        sources: arrays that each field comes from.
-        others: stamps (K,) [s] beside those of `time`, by the name of their array.
+        sources: arrays of each field.
+        others: other stamps (K,) [s] than `time`, by the name of their array.
 
     Raises:
         LogError: as `read_joined`.
@@ -179,16 +178,16 @@ def align_by_stamps(raw: Fields, sources: Mapping[str, Sequence[str]], others: M
             beside = next(iter(sources.get(field, ())), "")
             parts[own_stamps(values if field_shape(field)[:1] == ("N",) else None, beside, stamps)][field] = values
     used = {name: _stamped(part, 0.0) for name, part in parts.items() if len(part) > 1}
-    return _joined([f"what has the stamps '{excerpt(name)}'" for name in used], list(used.values()))
+    return _joined([f"the data with stamps '{excerpt(name)}'" for name in used], list(used.values()))
 
 
 def own_stamps(values: NDArray[Any] | None, name: str, stamps: Mapping[str, NDArray[Any]]) -> str:
-    """The stamps, by name, of an array (N, ...): as many; of several those with most of the first words of its name.
+    """The name of the stamps of an array (N, ...): equally many; among several, the ones with the most similar name.
 
-    The first ones where none are as many, or of what has no samples.
+    The first stamps if none are equally many, or if the array has no samples.
 
     Args:
-        values: of the array, None for what has no samples.
+        values: of the array, None for an array without samples.
         name: of the array.
         stamps: (K,) each.
     """
@@ -202,10 +201,9 @@ def own_stamps(values: NDArray[Any] | None, name: str, stamps: Mapping[str, NDAr
 
 
 def _joined(labels: Sequence[str], parts: Sequence[Fields], files: Sequence[str] = ()) -> Fields:
-    """The fields of all parts of a log at the stamps of the first; `files`: that they are in, if in several.
+    """The fields of all parts of a log at the stamps of the first; `files`: of the parts, if there are several.
 
-    A field may be in several parts, each with joints, contacts or sensors of its own; their order is that of the parts
-    that have them.
+    A field may be in several parts, each with other joints, contacts or sensors; they keep the order of the parts.
     """
     time = _common_stamps(labels, [part["time"] for part in parts])
     names: dict[str, list[str]] = {}
@@ -226,16 +224,15 @@ def _joined(labels: Sequence[str], parts: Sequence[Fields], files: Sequence[str]
 def _side_by_side(
     field: str, pieces: Sequence[tuple[str, list[str], NDArray[Any]]], names: list[str], files: Sequence[str]
 ) -> NDArray[Any]:
-    """A field with its columns in the order of the log's names, those of several files side by side.
+    """A field of several files with its columns in the order of the log's names.
 
     Raises:
-        LogError: a field in two files that have the same joints, contacts or sensors of it, or none; or one of these
-            that is in no file.
+        LogError: two files have the field for the same joints, contacts or sensors; or no file has it for one of them.
     """
     own_names = [name for _, of_file, _ in pieces for name in of_file]
     if len(pieces) > 1 and (len(set(own_names)) < len(own_names) or not all(of_file for _, of_file, _ in pieces)):
-        reason = f"both in {pieces[0][0]} and in {pieces[1][0]}"
-        accepted = "every field but time in one of several files, or other joints or contacts in each"
+        reason = f"in {pieces[0][0]} and in {pieces[1][0]}"
+        accepted = "each field in one file only, or with different joints or contacts in each file"
         raise LogError.at_field(field, reason, accepted)
     values = np.concatenate([x for *_, x in pieces], axis=1) if len(pieces) > 1 else pieces[0][2]
     own_names = own_names or names
@@ -245,18 +242,16 @@ def _side_by_side(
         kind_field = names_field(field)
         file = next((file for file in files if file.endswith(pieces[-1][0])), "")
         with about_file(file) if file else nullcontext():
-            where = f"in all files of a log, or in those that have {field} together, in any order"
-            accepted = f"the same {KINDS[kind_field]}s {where}"
+            accepted = f"all {KINDS[kind_field]}s of the log in the files with {field}, in any order"
             raise LogError.at_field(kind_field, f"'{missing[0]}' missing", accepted)
     return np.asarray(values[:, [own_names.index(name) for name in names]])
 
 
 def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Sequence[str]) -> list[Columns]:
-    """The map without the entries that are for others of several files, for each.
+    """Split a map of columns: for each of several files, the entries that apply to it.
 
-    Entries without columns are for the file with the field that they belong to. Of columns that several files have, a
-    name says before `::` of which file they are: `torques.csv::{joint}`. An entry may have joints, contacts or sensors
-    in each of several files.
+    Entries without columns go to the file with their field. If several files have the same column, `::` separates the
+    file from the column: `torques.csv::{joint}`. An entry may have joints, contacts or sensors in several files.
 
     Args:
         columns: the map.
@@ -264,14 +259,14 @@ def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Seq
         files: their names.
 
     Raises:
-        LogError: an entry of which no file has a column.
+        LogError: no file has a column of an entry.
     """
     maps = [columns_of_file(as_in_file(columns, file, files), texts) for file, texts in zip(files, given, strict=True)]
     entries = [_entries_in(of_file, texts) for of_file, texts in zip(maps, given, strict=True)]
     for name in columns.fields:
         if not any(name in of_file for of_file in entries):
-            none = f"no column of it in {join_names(files, MOST_LISTED)}"
-            raise LogError.at_field(f"{KEY}.{name}", none, "columns that one of the files has")
+            none = f"{join_names(files, MOST_LISTED)} have no such column"
+            raise LogError.at_field(f"{KEY}.{name}", none, "a column of one of the files")
     out = []
     for of_file, has in zip(maps, entries, strict=True):
         without: dict[str, Any] = dict.fromkeys({*columns.fields, "imu_frame"} - has)
@@ -281,9 +276,9 @@ def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Seq
 
 
 def _entries_in(columns: Columns, given: Sequence[str]) -> set[str]:
-    """Entries of a map of which a file has a column, and those without columns that belong to one of its fields.
+    """Entries of a map with a column in a file, and entries without columns that belong to one of its fields.
 
-    Stamps by their step belong to every file without a column of stamps.
+    A constant step of time applies to every file without a column of stamps.
     """
     parts = list_parts(columns).values()
     patterns = [
@@ -315,9 +310,8 @@ def _maps(paths: Sequence[Path], columns: Columns | None) -> list[Columns | None
     if columns is None:
         return [None for _ in paths]
     if columns.rows_of is not None:
-        raise LogError.at_field(
-            f"{KEY}.rows_of", "given for several files", "one file; or convert it to one of columns"
-        )
+        accepted = "one file; or first convert it with torchid convert"
+        raise LogError.at_field(f"{KEY}.rows_of", "not supported for several files", accepted)
     given = []
     for path in paths:
         with about_file(os.fspath(path)):
@@ -334,9 +328,9 @@ def _names_in(path: Path) -> list[str]:
 
 
 def _stamped(raw: Fields, shift_s: float) -> Fields:
-    """The fields of a file, those that have anything in them, with its stamps (K,) [s] in the clock of the log."""
+    """The fields of a file that are not empty, with its stamps (K,) [s] in the clock of the log."""
     if "time" not in raw:
-        raise LogError.at_field("time", "missing", "stamps in each of several files of a log")
+        raise LogError.at_field("time", "missing", "stamps in each file of the log")
     time = parse_time(raw["time"])
     out = {name: x for name, x in raw.items() if name not in NAME_FIELDS}
     out |= {name: np.array(x, np.str_) for name in NAME_FIELDS if name in raw and (x := parse_names(name, raw[name]))}
@@ -356,10 +350,9 @@ def _common_stamps(labels: Sequence[str], stamps: Sequence[FloatArray]) -> Float
     early = min(range(len(labels)), key=lambda number: stamps[number][-1])
     common = time[(time >= stamps[late][0] - slack) & (time <= stamps[early][-1] + slack)]
     if not len(common):
-        reason = f"no stamp of {labels[0]} that all files cover: "
-        reason += f"{labels[late]} starts at {stamps[late][0]:.6f} s, "
-        reason += f"{labels[early]} ends at {stamps[early][-1]:.6f} s"
-        raise LogError.at_field("time", reason, "stamps of one clock, or shift_s, what is added to those of a file")
+        reason = f"no time that all files share with {labels[0]}: {labels[late]} starts at {stamps[late][0]:.6f} s,"
+        reason += f" {labels[early]} ends at {stamps[early][-1]:.6f} s"
+        raise LogError.at_field("time", reason, "stamps of one clock; shift_s adds a time to those of a file")
     return common
 
 
@@ -377,7 +370,7 @@ def _aligned(part: Fields, time: FloatArray, origin: float) -> Fields:
 
 
 def _check_unbroken(name: str, values: FloatArray, time: FloatArray) -> None:
-    """Refuse a field (K, ...) that no spline can be drawn through."""
+    """Refuse a field (K, ...) with values that a spline cannot interpolate."""
     if name not in NAN_ALLOWED and np.isnan(values).any():
         refuse_gaps(name, values, time)
     check_finite(name, values, allow_nan=True)

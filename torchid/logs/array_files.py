@@ -137,17 +137,17 @@ class _Npz(ServedArrays):
         """
         entry = self._archive.getinfo(f"{name}.npy")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError("compressed in a way that NumPy does not use")
+            raise ValueError("unsupported compression")
         with self._archive.open(entry) as stream:
             version = np.lib.format.read_magic(stream)
             if version not in _HEADERS:
-                raise ValueError(f"version {version} of the format, which is not supported")
+                raise ValueError(f"unsupported version {version} of the format")
             with _python_2_headers_allowed():
                 shape, fortran_order, dtype = _HEADERS[version](stream)
             header = stream.tell()
         content = entry.file_size - header
         if not dtype.hasobject and math.prod(shape) * dtype.itemsize != content:
-            raise ValueError(f"{content} bytes for an array of shape {shape}, {dtype.itemsize} bytes each")
+            raise ValueError(f"{content} bytes do not fit an array of shape {shape} with {dtype.itemsize} bytes each")
         if dtype.kind in "US":
             check_names(shape)
         return entry, shape, fortran_order, dtype, header
@@ -199,7 +199,7 @@ class _Hdf5(ServedArrays):
         for prefix, group in groups:
             count += len(group)
             if count > MAX_DATASETS:
-                raise ValueError(f"{count} arrays and groups, more than the {MAX_DATASETS} that a log may have")
+                raise ValueError(f"{count} arrays and groups; a log may have {MAX_DATASETS}")
             for name in group if prefix else [name for name in group if name not in _OF_MATLAB]:
                 inner = self._item(group, name)
                 if isinstance(inner, self._h5py.Group) and len(inner) and prefix.count("/") < _DEPTH:
@@ -231,7 +231,7 @@ class _Hdf5(ServedArrays):
         item = self._item(self._file, name)
         is_dataset = isinstance(item, self._h5py.Dataset) and item.shape is not None
         if not is_dataset or item.is_virtual or item.external is not None:
-            raise TypeError("not a dataset with values in this file")
+            raise TypeError("a dataset without values in this file")
         return item
 
     def _item(self, group: Any, name: str) -> Any:
@@ -296,7 +296,7 @@ def _read_json(path: Path) -> Iterator[tuple[str, AnyArray]]:
     """Arrays by name of an object of arrays or a list of records; `group/name` of those in objects."""
     document = json.loads(path.read_text(encoding="utf-8-sig"))
     if not isinstance(document, dict) and not _are_records(document):
-        raise ValueError(f"a {type(document).__name__}, no object of arrays and no list of records")
+        raise ValueError(f"found a {type(document).__name__}, not an object of arrays or a list of records")
     yield from ((name, _json_array(value)) for name, value in _flat("", document))
 
 

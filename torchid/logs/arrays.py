@@ -16,14 +16,14 @@ from torchid.logs.log import SHAPES, check_shape
 
 
 def parse_names(name: str, array: NDArray[Any]) -> tuple[str, ...]:
-    """The names in a one-dimensional array of strings or UTF-8 bytes, LogError on anything else or a duplicate."""
+    """The names in a one-dimensional array of strings or UTF-8 bytes; LogError for other values or duplicates."""
     check_shape(name, array, SHAPES[name] or (1,), {})
     if array.size and array.dtype.kind not in "US":
         raise LogError.at_field(name, f"values of type {array.dtype}", "strings")
     try:
         names = tuple(item.decode() if isinstance(item, bytes) else str(item) for item in array.tolist())
     except UnicodeDecodeError as error:
-        raise LogError.at_field(name, f"bytes that are no text ({error})", "UTF-8 strings") from error
+        raise LogError.at_field(name, f"not text ({error})", "UTF-8 strings") from error
     seen: set[str] = set()
     for i, item in enumerate(names):
         if len(item) > MAX_LETTERS or not is_plain(item):
@@ -31,32 +31,32 @@ def parse_names(name: str, array: NDArray[Any]) -> tuple[str, ...]:
             raise LogError.at_field(name, f"'{excerpt(item)}' at {i}", accepted)
         if not item or item in seen:
             reason = f"'{item}' again at {i}" if item else f"an empty name at {i}"
-            raise LogError.at_field(name, reason, "names that are all different")
+            raise LogError.at_field(name, reason, "different names")
         seen.add(item)
     return names
 
 
 def parse_frame(name: str, array: NDArray[Any]) -> str:
-    """The one name in an array of strings or UTF-8 bytes of any shape, LogError on anything else."""
+    """The single name in an array of strings or UTF-8 bytes of any shape; LogError for anything else."""
     if array.size != 1:
         raise LogError.at_field(name, f"{array.size} values", "one name")
     return parse_names(name, array.reshape(1))[0]
 
 
-ARRAY_ACCEPTED = "a plain array of numbers, truth values or text"
-"""Accepted where the reader of a file fails at an array."""
+ARRAY_ACCEPTED = "a plain array of numbers, booleans or text"
+"""Accepted value, for an array that cannot be read."""
 
 TRANSPOSED = ".T"
-"""Behind the name of an array whose columns are the samples."""
+"""Suffix of the name of an array with samples as columns."""
 
 _PART = re.compile(r"(?P<array>.+)(?:\[(?P<first>\d*):(?P<last>\d*)\]|\['(?P<field>[^'\[\]]+)'\]|\.T)")
-"""What a name may mean of another array: some columns, a field of records, or the transposed array."""
+"""Parts of an array that a name may mean: some columns, a field of records, or the transposed array."""
 
 AnyArray = NDArray[Any]
 
 
 def _split_parts(name: str, given: Collection[str]) -> tuple[str, list[re.Match[str]]]:
-    """The array of a file that a name means a part of, and the parts of parts, the largest first."""
+    """The array behind a name with parts, and these parts, the outermost first."""
     parts = list[re.Match[str]]()
     while name not in given and (part := _PART.fullmatch(name)) is not None:
         parts.insert(0, part)
@@ -65,7 +65,7 @@ def _split_parts(name: str, given: Collection[str]) -> tuple[str, list[re.Match[
 
 
 def _part_of(array: AnyArray, part: re.Match[str]) -> AnyArray:
-    """The part of an array; LogError where it has none."""
+    """A part of an array; LogError if the array has no such part."""
     by_samples = f"an array of shape ({', '.join(map(str, ('N', *array.shape[1:])))})"
     if (field := part["field"]) is not None:
         fields = array.dtype.names
@@ -75,21 +75,21 @@ def _part_of(array: AnyArray, part: re.Match[str]) -> AnyArray:
         raise LogError.at_field(f"'{part[0]}'", "no such field" if fields else by_samples, accepted)
     if part["first"] is None:
         if array.ndim != 2:
-            raise LogError.at_field(f"'{part[0]}'", f"a {array.ndim}-dimensional array", "one of rows and columns")
+            raise LogError.at_field(f"'{part[0]}'", f"a {array.ndim}-dimensional array", "a 2-dimensional array")
         return array.T
     width = array.shape[1] if array.ndim > 1 else 0
     start = int(part["first"] or 0)
     stop = int(part["last"] or width)
     if start >= stop or stop > width:
-        raise LogError.at_field(f"'{part[0]}'", by_samples, "columns that it has, counted from 0")
+        raise LogError.at_field(f"'{part[0]}'", by_samples, "existing columns, counted from 0")
     return np.asarray(array[:, start:stop])
 
 
 def load_part(name: str, given: Collection[str], load: Callable[[str], AnyArray]) -> AnyArray:
-    """An array of a file, or the part of one that a name of `with_parts` means.
+    """An array of a file, or a part of one, by a name of `with_parts`.
 
     Raises:
-        LogError: an array that has no such part.
+        LogError: the array has no such part.
     """
     array_name, parts = _split_parts(name, given)
     array = load(array_name)
@@ -99,13 +99,13 @@ def load_part(name: str, given: Collection[str], load: Callable[[str], AnyArray]
 
 
 def sample_axis(name: str, given: Collection[str]) -> tuple[str, int]:
-    """The array of a file that a name means a part of, and which of its axes counts samples, 0 or 1."""
+    """The array behind a name, and its axis of samples, 0 or 1."""
     array_name, parts = _split_parts(name, given)
     return array_name, sum(part[0].endswith(TRANSPOSED) for part in parts) % 2
 
 
 def with_parts(given: Sequence[str], wanted: Iterable[str]) -> list[str]:
-    """Names of arrays, those of which a map wants parts replaced by these."""
+    """Names of arrays; if a map wants parts of an array, the names of these parts instead."""
     parts = defaultdict[str, dict[str, None]](dict)
     for text in wanted:
         parts[_split_parts(text, given)[0]][text] = None
@@ -113,15 +113,15 @@ def with_parts(given: Sequence[str], wanted: Iterable[str]) -> list[str]:
 
 
 def require_plain(name: str, array: AnyArray) -> AnyArray:
-    """The array itself; LogError for one of Python objects, which no reader of a log loads."""
+    """The array itself; LogError for an array of Python objects."""
     if array.dtype.hasobject:
-        accepted = "plain arrays, one for each field: numpy.savez(path, time=..., q=...)"
+        accepted = "one plain array per field: numpy.savez(path, time=..., q=...)"
         raise LogError.at_field(name, "Python objects (pickled), references or ragged rows", accepted)
     return array
 
 
 def fields_of_records(name: str, array: AnyArray) -> Iterator[tuple[str, AnyArray]]:
-    """The fields of an array of records, by the names that mean them, of records in records too; else the array."""
+    """The fields of an array of records by name, also of nested records; any other array itself."""
     if not array.dtype.names:
         yield name, array
     for field in array.dtype.names or ():

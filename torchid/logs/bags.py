@@ -129,8 +129,8 @@ def list_channels(files: list[Path]) -> dict[str, BagChannel]:
             for channel in [BagChannel(*names) for names in opened.call("channels")]:
                 first = channels.setdefault(channel.topic, channel)
                 if first != channel:
-                    reason = f"both {first.type} and {channel.type}"
-                    raise LogError.at_field(channel.topic, reason, "one type of message per topic")
+                    reason = f"has messages of {first.type} and {channel.type}"
+                    raise LogError.at_field(channel.topic, reason, "one message type per topic")
     return channels
 
 
@@ -167,7 +167,7 @@ def make_deserializer(topic: str, channel: BagChannel) -> Callable[[bytes], Any]
 
     def deserialize(data: bytes) -> Any:
         if data.startswith(_ZSTD):
-            raise LogError.at_field(topic, "messages compressed one by one", "a bag without message compression")
+            raise LogError.at_field(topic, "each message is compressed", "a bag without message compression")
         return store.deserialize_cdr(data, channel.type)
 
     return deserialize
@@ -242,7 +242,7 @@ class _Messages:
         for part in numbers:
             rows.values.extend(part)
         if 8 * sum(len(rows.values) for rows in self.rows.values()) > MAX_ARRAYS:
-            raise LogError.at_field(self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
+            raise LogError.at_field(self.topic, "too many messages", f"at most {MAX_ARRAYS} bytes")
 
     def _check_frame(self, message: Any) -> None:
         if self.type not in (*IMUS, *ODOMETRIES, WRENCHES[0]):
@@ -270,7 +270,7 @@ class _Messages:
         layout, *others = self.rows
         if others:
             reason = f"arrays of {' and '.join(str(sum(lengths)) for _, lengths in self.rows)} numbers"
-            raise LogError.at_field(self.topic, reason, "as many in every message")
+            raise LogError.at_field(self.topic, reason, "equally many numbers in every message")
         return self.parts(layout)
 
 
@@ -330,10 +330,10 @@ def _series(topic: AnyTopic, messages: _Messages) -> _TopicSeries:
         rows = np.concatenate([x[again] for x in fields.values()], axis=1).view(np.int64)
         differ = np.any(rows != np.concatenate([x[again - 1] for x in fields.values()], axis=1).view(np.int64), axis=1)
         if differ.any():
-            reason = f"messages of different content with one stamp, {stamps[again[np.argmax(differ)]] / 1e9:.9f} s"
+            reason = f"different messages with the same stamp, {stamps[again[np.argmax(differ)]] / 1e9:.9f} s"
             by_tick = f", or {_LOW_STATE}.stamps: receipt" * isinstance(topic, LowStateTopic)
-            raise LogError.at_field(str(topic.topic), reason, "every stamp once" + by_tick)
-        warn_about_file(f"{topic.topic}: {len(again)} messages come twice; each counts once")
+            raise LogError.at_field(str(topic.topic), reason, "different stamps" + by_tick)
+        warn_about_file(f"{topic.topic}: {len(again)} duplicate messages are ignored")
         stamps = np.delete(stamps, again)
         fields = {name: np.delete(x, again, axis=0) for name, x in fields.items()}
     return _TopicSeries(messages.topic, stamps, fields, stamped, names)
@@ -358,7 +358,7 @@ def _joint_parts(topic: JointTopic, messages: _Messages) -> tuple[tuple[str, ...
         if [_JOINT_FIELDS[path] for path in of_layout] != common or "position" not in of_layout:
             in_all = " and ".join(path for path, name in _JOINT_FIELDS.items() if name in common)
             reason = f"a message with {' and '.join(of_layout) or 'nothing'}"
-            raise LogError.at_field(messages.topic, reason, f"positions, and in every message {in_all or 'the same'}")
+            raise LogError.at_field(messages.topic, reason, f"positions, and {in_all or 'the same'} in every message")
         if any(length != len(names) for length in lengths if length):
             reason = f"{len(rows.values)} values in {len(rows.stamps)} messages of {len(names)} names"
             raise LogError.at_field(messages.topic, reason, f"one {' and one '.join(of_layout)} per name")
@@ -384,12 +384,12 @@ def _joint_parts(topic: JointTopic, messages: _Messages) -> tuple[tuple[str, ...
 def _check_joints(topic: JointTopic, names: Sequence[str], wanted: Sequence[str]) -> None:
     """Refuse a message in which joints repeat, or that does not have all that are wanted."""
     if len(set(names)) != len(names):
-        reason = f"names {', '.join(names[:4])}, ... that repeat"
-        raise LogError.at_field(topic.topic, reason, "joints of different names")
+        reason = f"repeated names: {', '.join(names[:4])}, ..."
+        raise LogError.at_field(topic.topic, reason, "different joint names")
     missing = [name for name in wanted if name not in names]
     if missing or (not topic.joints and len(names) != len(wanted)):
         reason = f"a message without {missing[0]}" if missing else f"a message with {len(names)} joints"
-        accepted = f"all {len(wanted)} joints in every message, or joint_states.joints with those that are"
+        accepted = f"all {len(wanted)} joints in every message, or joint_states.joints with the joints that are"
         raise LogError.at_field(topic.topic, reason, accepted)
 
 
@@ -411,8 +411,8 @@ def _fields(topic: AnyTopic, messages: _Messages, parts: Mapping[str, FloatArray
         return {"active": rows}
     column = ("fx", "fy", "fz").index(topic.component or "fz") if messages.type in WRENCHES else topic.index or 0
     if column >= rows.shape[1]:
-        reason = f"an array of {rows.shape[1]} numbers, without index {column}"
-        raise LogError.at_field(messages.topic, reason, "an index below that, from 0 on")
+        reason = f"an array of {rows.shape[1]} numbers has no index {column}"
+        raise LogError.at_field(messages.topic, reason, f"an index from 0 to {rows.shape[1] - 1}")
     return {"force": topic.sign * rows[:, column : column + 1]}
 
 
@@ -422,13 +422,17 @@ def _imu_fields(topic: ImuTopic, parts: Mapping[str, FloatArray]) -> dict[str, F
     out = dict(zip(fields, (parts[part] for part in _IMU_PARTS), strict=False))
     for part in _IMU_PARTS[: len(fields)]:
         if (parts[f"{part}_covariance.0"] == -1.0).any():
-            accepted = "an IMU with both" if part != "orientation" else f"{_IMU}.orientation: false"
+            accepted = (
+                "an IMU with linear_acceleration and angular_velocity"
+                if part != "orientation"
+                else f"{_IMU}.orientation: false"
+            )
             raise LogError.at_field(topic.topic, f"no {part} (the first of its covariances is -1)", accepted)
     if topic.orientation:
         quat = out["base_quat_xyzw"]
         if len(quat) > 1 and not np.any(quat != quat[0]):
-            reason = f"one orientation throughout, {np.round(quat[0], 3).tolist()}, as of a driver without any"
-            raise LogError.at_field(topic.topic, reason, f"orientations, or {_IMU}.orientation: false")
+            reason = f"always the same orientation {np.round(quat[0], 3).tolist()}: the driver does not measure it"
+            raise LogError.at_field(topic.topic, reason, f"measured orientations, or {_IMU}.orientation: false")
         out["base_quat_xyzw"] = require_unit(topic.topic, quat, _IMU)
     return out
 
@@ -452,14 +456,14 @@ def _check_low_state(topic: LowStateTopic, field: str, kind: str) -> None:
     robot = JOINT_ORDERS.get(topic.robot or "")
     if robot is not None and robot.message != kind:
         others = ", ".join(x for x, order in JOINT_ORDERS.items() if order.message == kind)
-        reason = f"'{topic.robot}', which sends {robot.message}, though {topic.topic} carries {kind}"
+        reason = f"'{topic.robot}' sends {robot.message}, but {topic.topic} has {kind}"
         raise LogError.at_field(f"{field}.robot", reason, others)
     if len(topic.order) > MOTORS[kind]:
-        reason = f"{len(topic.order)} names, though {kind} has {MOTORS[kind]} motors"
-        raise LogError.at_field(f"{field}.joints", reason, "at most that many, by number of the motor")
+        reason = f"{len(topic.order)} names, but {kind} has {MOTORS[kind]} motors"
+        raise LogError.at_field(f"{field}.joints", reason, f"at most {MOTORS[kind]} names, by motor number")
     if topic.reads_feet and kind != GO:
         key = "forces" if topic.forces else "above"
-        raise LogError.at_field(f"{field}.{key}", f"set, though {kind} has no foot sensors", f"no {key}")
+        raise LogError.at_field(f"{field}.{key}", f"set, but {kind} has no foot sensors", f"no {key}")
 
 
 def _low_state_fields(topic: LowStateTopic, parts: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -472,8 +476,8 @@ def _low_state_fields(topic: LowStateTopic, parts: Mapping[str, FloatArray]) -> 
         LogError: ankles and waist by motor rather than by joint, or quaternions of no length.
     """
     if (modes := parts["mode_pr"]).any():
-        reason = f"mode_pr {modes[modes != 0.0][0]:g}: ankles and waist by their parallel motors (A, B), not by joint"
-        raise LogError.at_field(topic.topic, reason, "messages with mode_pr 0: pitch and roll")
+        reason = f"mode_pr {modes[modes != 0.0][0]:g}: ankles and waist by parallel motors (A, B), not by joint"
+        raise LogError.at_field(topic.topic, reason, "messages with mode_pr 0 (pitch and roll)")
     numbers = [number for number, name in enumerate(topic.order) if name is not None]
     names = {"q": "joint_position", "dq": "joint_velocity", "tau_est": "joint_torque"}
     out = {name: parts[f"motor_state.{part}"][:, numbers] for part, name in names.items()}
@@ -538,7 +542,7 @@ class _Recording:
         stamps = rate.stamps[(rate.stamps >= late.stamps[0]) & (rate.stamps <= early.stamps[-1])]
         if not len(stamps):
             reason = (
-                f"no stamp of {rate.topic} that all topics cover: {late.topic} starts at {late.stamps[0] / 1e9:.3f}"
+                f"no time that all topics share with {rate.topic}: {late.topic} starts at {late.stamps[0] / 1e9:.3f}"
             )
             reason += f" s, {early.topic} ends at {early.stamps[-1] / 1e9:.3f} s"
             raise LogError.at_field("time", reason, "one common clock")
@@ -574,7 +578,7 @@ class _Recording:
         if self.topics.imu is not None:
             frame = self.topics.imu.frame or self.frame("imu").removeprefix("/")
             if not frame:
-                accepted = f"{_IMU}.frame, the robot's frame it sits at"
+                accepted = f"{_IMU}.frame: the robot's frame of the IMU"
                 raise LogError.at_field(self.topics.imu.topic, "no header.frame_id", accepted)
             out["imu_frame"] = np.array(frame)
         out.pop(_FEET, None)
@@ -588,8 +592,8 @@ class _Recording:
         for role in [role for role in self.topics.joint_topics if role != "joint_states"]:
             known = {name for part in parts for name in part["joint_names"].tolist()}
             if again := [name for name in self.series[role].names if name in known]:
-                accepted = f"logs.topics.{role}.joints, those that no other topic has"
-                raise LogError.at_field(self.series[role].topic, f"joint '{again[0]}', of another topic too", accepted)
+                accepted = f"logs.topics.{role}.joints with only the joints of this topic"
+                raise LogError.at_field(self.series[role].topic, f"joint '{again[0]}' is in two topics", accepted)
             parts.append(self.aligned(role) | {"joint_names": np.array(self.series[role].names, dtype=np.str_)})
         if len(parts) == 1:
             return {}
@@ -602,7 +606,7 @@ class _Recording:
         if len(given) == len(parts):
             out["joint_velocity"] = np.concatenate(given, axis=1)
         elif given:
-            warn_about_file("velocities of some topics of joints alone: left out, and derived from positions")
+            warn_about_file("only some joint topics have velocities; all are derived from positions")
             first.pop("joint_velocity", None)
         return out
 
@@ -647,7 +651,7 @@ class _Recording:
         with np.errstate(over="ignore"):  # infinite is above any threshold
             force = np.linalg.norm(fields["wrench"][:, :3], axis=1) if "wrench" in fields else fields["force"][:, 0]
         if np.isnan(force).any():
-            reason = f"a force of NaN in message {np.argmax(np.isnan(force))}"
+            reason = f"the force is NaN in message {np.argmax(np.isnan(force))}"
             accepted = "forces to compare with contact_force_threshold, or contact_active"
             raise LogError.at_field(self.series[role].topic, reason, accepted)
         return self.held(role, force) > topics.contact_force_threshold
@@ -671,7 +675,7 @@ class _Recording:
         frame = self.frame(role)
         if frame and (expected is None or frame.removeprefix("/") != expected.removeprefix("/")):
             taken_for = otherwise if expected is None else f"'{expected}'"
-            text = f"frame '{frame}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
+            text = f"frame '{frame}' is taken for {taken_for}; set logs.topics.{role}.frame to confirm it"
             warn_about_file(f"{self.series[role].topic}: {text}")
 
 
@@ -704,14 +708,14 @@ def read_bag(
     if topics is None:
         listed = [f"{name} ({channel.type})" for name, channel in channels.items()]
         reason = f"missing; the bag has {join_names(listed, _LISTED) or 'no topics'}"
-        raise LogError.at_field("logs.topics", reason, "what its topics hold, of which torchid init writes a first map")
+        raise LogError.at_field("logs.topics", reason, "a map of the topics; torchid init writes a first one")
     roles = {role: topic for role, topic in topics.by_role.items() if topic.topic is not None}
     for role, topic in roles.items():
         _check_type(f"logs.topics.{role}", topic, channels)
     messages = _read(files, channels, list(roles.values()), progress)
     series = {role: _series(topic, messages[str(topic.topic)]) for role, topic in roles.items()}
     if unstamped := dict.fromkeys(x.topic for x in series.values() if not x.stamped):
-        problem = "no stamps in the messages: the log takes the times of receipt, which are late and uneven"
+        problem = "the messages have no stamps; the log uses times of receipt, which are late and uneven"
         warn_about_file(f"{', '.join(unstamped)}: {problem}")
     recording = _Recording(topics, series, messages)
     return {"time": recording.time} | recording.motion() | recording.contacts() | recording.limb_sensors()
@@ -725,19 +729,19 @@ def _check_type(field: str, topic: AnyTopic, channels: Mapping[str, BagChannel])
     kind = channels[name].type
     if kind not in _TYPES[type(topic)]:
         instead = ", or logs.topics.low_state" * (kind in MOTORS)
-        raise LogError.at_field(field, f"{name} carries {kind}", " or ".join(_TYPES[type(topic)]) + instead)
+        raise LogError.at_field(field, f"{name} has messages of {kind}", " or ".join(_TYPES[type(topic)]) + instead)
     if isinstance(topic, LowStateTopic):
         _check_low_state(topic, field, kind)
     if not isinstance(topic, ForceTopic):
         return
     if kind in NUMBER_ARRAYS and topic.index is None:
-        reason = f"missing, though {name} carries {kind}"
-        raise LogError.at_field(f"{field}.index", reason, "which of its numbers is this contact's, from 0 on")
+        reason = f"missing, but {name} has {kind}"
+        raise LogError.at_field(f"{field}.index", reason, "the index of this contact's number, from 0 on")
     options = (("index", topic.index, NUMBER_ARRAYS), ("component", topic.component, WRENCHES))
     for option, value, kinds in options:
         if value is not None and kind not in kinds:
-            reason = f"{value!r}, though {name} carries {kind}"
-            raise LogError.at_field(f"{field}.{option}", reason, f"no {option} of such a message")
+            reason = f"{value!r}, but {name} has {kind}"
+            raise LogError.at_field(f"{field}.{option}", reason, f"no {option} for such messages")
 
 
 def _read(

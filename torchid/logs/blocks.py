@@ -37,7 +37,7 @@ from torchid.logs.tables import common_texts, table_blocks, table_size
 from torchid.logs.time_range import split_range
 
 GIGABYTE = 1e9
-_WHOLE = "a larger preprocessing.memory_gb, or the file that torchid convert makes of it"
+_WHOLE = "a larger preprocessing.memory_gb, or first torchid convert"
 _BYTES_PER_LETTER = 4  # of a table: a cell has at least two characters, a number eight bytes
 
 
@@ -147,7 +147,7 @@ def _open_arrays(container: Container, folder: Path, columns: Columns | None, ne
     """Fields of a container, whose arrays are read where they are sliced."""
     given = list(container.declared_bytes())
     if columns is not None and columns.episodes is not None:
-        raise LogError.at_field("file", "episodes side by side, read whole", _WHOLE)
+        raise LogError.at_field("file", "a file with several episodes must fit into memory", _WHOLE)
 
     def load(name: str) -> NDArray[Any]:
         with reader_errors_explained(name, ARRAY_ACCEPTED):
@@ -156,7 +156,7 @@ def _open_arrays(container: Container, folder: Path, columns: Columns | None, ne
     mapped = match_arrays(columns, given, load)
     check_fields_given(mapped.given, needs_flags)
     if others := list(mapped.other_times(given)):
-        raise LogError.at_field("file", f"stamps beside those of time ('{excerpt(others[0])}'), read whole", _WHOLE)
+        raise LogError.at_field("file", f"a file with stamps '{excerpt(others[0])}' must fit into memory", _WHOLE)
     sources = {source: sample_axis(source, given) for source in mapped.sources if source != mapped.frame_column}
     shapes = dict[str, tuple[int, ...]]()
     counts = dict[str, int]()
@@ -192,7 +192,7 @@ def _common_length(sources: Sequence[str], counts: Mapping[str, int], constant: 
     most = max((counts[source] for source in sampled), default=0)
     for source in sampled:
         if counts[source] != most:
-            raise LogError.at_field(f"'{source}'", f"{counts[source]} samples", f"{most}, as others have")
+            raise LogError.at_field(f"'{source}'", f"{counts[source]} samples", f"{most}, as in the other arrays")
     return most
 
 

@@ -1,4 +1,4 @@
-"""What foreign columns and arrays hold: `logs.columns` of an experiment file, its entries and their checks."""
+"""The map of foreign columns and arrays, `logs.columns` of an experiment file: its entries and their checks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from torchid.settings import STRICT, Name, Number, Positive
 
 KEY = "logs.columns"
 FILL_IN = "FILL_IN"
-"""What `torchid init` writes where a person has to say something."""
+"""Placeholder of `torchid init` for a value that the user must fill in."""
 
 COLUMN_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 """Fields of a log that columns of a table may have."""
@@ -33,7 +33,7 @@ PLACEHOLDER = re.compile(r"\{([^{}:]*)(?::(0\d))?\}")
 
 AXES = ("axis", "AXIS", "component")
 MOST_LISTED = 12
-"""Names that a message lists."""
+"""Most names that a message lists."""
 
 _UNNAMED = re.compile(r"column_\d+")  # of a table of text that has no line of names, by their place
 OF_FILE = "::"
@@ -70,21 +70,21 @@ def format_pattern(field: str) -> str:
 
 
 def unknown_columns(columns: Sequence[str], has_map: bool) -> LogError:
-    """The error of columns or arrays that neither the log format nor a map knows, all in one line."""
+    """The error for columns or arrays that neither the log format nor the map knows."""
     field = columns[0].partition(".")[0]
     if has_map:
         accepted = f"an entry for each column, or its name in {KEY}.ignore"
         return LogError.at_field(KEY, f"no entry for {join_names(columns, MOST_LISTED)}", accepted)
     if len(columns) == 1 and field in COLUMN_FIELDS and "[" not in columns[0]:
         accepted = format_pattern(field).replace("{axis}", "{" + ", ".join(component_names(field)) + "}")
-        return LogError.at_field(f"column '{columns[0]}'", "no such part of this field", accepted)
+        return LogError.at_field(f"column '{columns[0]}'", "this field has no such component", accepted)
     is_misspelt = field not in COLUMN_FIELDS and difflib.get_close_matches(field, COLUMN_FIELDS, cutoff=0.6)
     if len(columns) == 1 and is_misspelt:
         return UnknownFieldError.at_field(f"column '{columns[0]}'", field, COLUMN_FIELDS)
     reason = f"{len(columns)} unknown: {join_names(columns, MOST_LISTED)}"
     if all(map(_UNNAMED.fullmatch, columns)):
-        reason = f"{len(columns)} of numbers without a line of names"
-    accepted = "names of the log format, or logs.columns of an experiment file, which says what they hold"
+        reason = f"{len(columns)} columns of numbers without a line of names"
+    accepted = "names of the log format, or a map of the columns (logs.columns) in an experiment file"
     return LogError.at_field("columns", reason, f"{accepted}; torchid init writes one")
 
 
@@ -92,7 +92,7 @@ def unknown_columns(columns: Sequence[str], has_map: bool) -> LogError:
 
 
 def for_all(value: Any) -> Any:
-    """A map of values by pattern, where one value is for all names."""
+    """Values by pattern; a single value becomes the value of all names."""
     return value if isinstance(value, Mapping) else {"*": value}
 
 
@@ -113,14 +113,14 @@ class ColumnEntry:
     """The columns, or the array, of one field.
 
     Attributes:
-        column: its name, or a pattern: `{joint}`, `{contact}` or `{sensor}` stands for a name, `{index}` for the number
-            of one in `order` (or of a component), `{axis}` for a component (x, y, z; w, x, y, z; fx to mz), `{AXIS}`
+        column: its name, or a pattern: `{joint}`, `{contact}` or `{sensor}` stands for a name, `{index}` for its number
+            in `order` (or that of a component), `{axis}` for a component (x, y, z; w, x, y, z; fx to mz), `{AXIS}`
             for the same in capitals.
-        columns: by name or component, its column, in place of a pattern.
-        order: names, by number; null for a number that is no joint (contact, sensor) of the robot.
-        first_index: number of the first of them.
-        unit: by pattern of a name or component, or one for all; SI units by default.
-        scale: what numbers are multiplied by, likewise: -1 turns a sign.
+        columns: the column of each name or component, instead of a pattern.
+        order: names by number; null for a number without a joint (contact, sensor) of the robot.
+        first_index: number of the first name.
+        unit: one for all, or by pattern of the name or component; SI units by default.
+        scale: factor of the numbers, one for all or by pattern; -1 reverses a sign.
     """
 
     column: Name | None = None
@@ -132,7 +132,7 @@ class ColumnEntry:
 
 
 FRACTIONS = {"nanoseconds": "ns", "microseconds": "us"}
-"""Units of what may be added to whole seconds, by key."""
+"""Units of the fractions that may be added to whole seconds, by key."""
 
 Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
 
@@ -142,8 +142,8 @@ class TimeEntry(ColumnEntry):
     """Stamps as a column.
 
     Attributes:
-        nanoseconds, microseconds: column of what is added to it [ns, us], of stamps in two columns.
-        step: in place of a column, how much later each sample is than the one before, in the unit.
+        nanoseconds, microseconds: column with the fraction [ns, us], for stamps in two columns.
+        step: constant step between samples in the unit, instead of a column.
     """
 
     nanoseconds: Name | None = None
@@ -153,9 +153,9 @@ class TimeEntry(ColumnEntry):
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class AngleEntry(ColumnEntry):
-    """Positions of joints; `turn_from`: where the turn begins that angles are counted in, in their unit.
+    """Positions of joints; `turn_from`: the smallest angle of the turn, in the unit of the angles.
 
-    Of an encoder that jumps from 359 to 0 deg, -180 makes 359 deg -1 deg.
+    Example: an encoder jumps from 359 to 0 deg; with `turn_from: -180`, 359 deg becomes -1 deg.
     """
 
     turn_from: Annotated[dict[str, Number], BeforeValidator(for_all)] = dataclasses.field(default_factory=dict)
@@ -166,7 +166,7 @@ class QuaternionEntry(ColumnEntry):
     """The base's orientation as columns of a quaternion.
 
     Attributes:
-        rpy: in its place, angles (roll, pitch, yaw) as a URDF has them: about the world's x, then y, then z.
+        rpy: angles (roll, pitch, yaw) as in a URDF (about the world's x, then y, then z), instead of a quaternion.
     """
 
     rpy: Entry | None = None
@@ -184,7 +184,7 @@ GainsEntry = Annotated[Gains, BeforeValidator(_gains)]
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class PdLaw:
-    """kp (position - q) + kd (velocity - dq) + feed_forward, with desired values; what is not given is 0."""
+    """kp (position - q) + kd (velocity - dq) + feed_forward, with desired values; missing terms are 0."""
 
     kp: GainsEntry | None = None
     kd: GainsEntry | None = None
@@ -195,11 +195,11 @@ class PdLaw:
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class CurrentEntry(ColumnEntry):
-    """Currents of motors as columns [A], of which torques are made.
+    """Motor currents as columns [A]; torques are computed from them.
 
     Attributes:
-        torque_constant: by pattern of the joint or one for all, torque of the motor for its current [N m/A].
-        gear_ratio: likewise, turns of the motor for one of the joint (radians for a metre of a slide).
+        torque_constant: motor torque per current [N m/A], one for all or by pattern of the joint.
+        gear_ratio: motor turns per joint turn (radians per metre of a slide), one for all or by pattern of the joint.
     """
 
     torque_constant: Annotated[dict[str, Number], BeforeValidator(for_all)]
@@ -208,7 +208,7 @@ class CurrentEntry(ColumnEntry):
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class TorqueEntry(ColumnEntry):
-    """Torques as columns, of a PD law, or of the currents of motors."""
+    """Torques as columns, from a PD law, or from motor currents."""
 
     pd: PdLaw | None = None
     current: CurrentEntry | None = None
@@ -219,9 +219,8 @@ class FlagEntry(ColumnEntry):
     """Contact flags as columns.
 
     Attributes:
-        above: contacts are active where the number is above this, in its unit; without columns that of the contact's
-            force [N].
-        always: contacts that are active throughout, in place of columns.
+        above: a contact is active while its number is above this; without columns, while its force is [N].
+        always: contacts that are active in all samples, instead of columns.
     """
 
     above: Number | None = None
@@ -230,7 +229,7 @@ class FlagEntry(ColumnEntry):
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class VectorEntry(ColumnEntry):
-    """Moments or points as columns of their components; `axes`: those that have one, others are 0."""
+    """Moments or points as columns of their components; `axes`: components with a column, the others are 0."""
 
     axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1)] | None = None
 
@@ -240,7 +239,7 @@ Vector = Annotated[VectorEntry, BeforeValidator(_column)]
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class WrenchEntry(ColumnEntry):
-    """Wrenches as columns of all components, or forces and moments each for themselves (x, y, z); no moments: NaN."""
+    """Wrenches as columns of all components, or as separate forces and moments (x, y, z); missing moments are NaN."""
 
     force: Entry | None = None
     moment: Vector | None = None
@@ -248,7 +247,7 @@ class WrenchEntry(ColumnEntry):
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class Plate:
-    """Pose of a force plate, of the axes and the origin that its readings have, in the world.
+    """Pose of a force plate in the world: the axes and the origin of its readings.
 
     Attributes:
         position: [m], of the origin.
@@ -261,12 +260,12 @@ class Plate:
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class Episodes:
-    """Recordings side by side in a file of arrays, which become one after the other.
+    """Several recordings in one file of arrays; they are read one after the other.
 
     Attributes:
-        axis: of arrays, that counts them: 0 of (episodes, samples, ...), 1 of (samples, episodes, ...).
-        lengths: array with the number of samples of each, where arrays are filled up behind these.
-        groups: in place of an axis, name of the groups that hold one each, with * for their number: `data/demo_*`.
+        axis: of the episodes: 0 for arrays (episodes, samples, ...), 1 for (samples, episodes, ...).
+        lengths: array with the number of samples of each episode, if arrays are padded.
+        groups: instead of an axis, the name of the groups with one episode each, with * for the number: `data/demo_*`.
     """
 
     axis: Literal[0, 1] = 0
@@ -284,23 +283,23 @@ Wrench = Annotated[WrenchEntry, BeforeValidator(_column)]
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class Columns:
-    """What the columns of a table, or the arrays of a file, hold; those with names of the log format need no entry.
+    """Meaning of the columns of a table, or of the arrays of a file; names of the log format need no entry.
 
     Keys are the fields of a log, and:
 
     Attributes:
-        imu_frame: the frame of the URDF that the IMU sits at: no column, but the name itself.
+        imu_frame: the URDF frame of the IMU: the name itself, not a column.
         other_times: entries like `time`, for files without its column.
-        joint_order: names of joints by number, for entries without `order`, or the robot whose order it is (`go2`);
-            `contact_order`, `sensor_order`: as well.
-        joint_name: what the joint that the file calls {joint} is called in the URDF, such as `{joint}_joint`.
-        contact_name: as well, of {contact}.
-        plates: by pattern of the contact, pose of the force plate whose axes and origin `contact_wrench_world` and
-            `contact_wrench_point_world` have.
-        rows_of: the column that names the joint of a row, of a table with a row for each joint at each stamp: its
-            other columns are then `position.l_knee`, ...
-        episodes: where recordings lie side by side in arrays, or in groups of these.
-        ignore: columns that are not needed; * and ? stand for others.
+        joint_order: joint names by number, for entries without `order`; or the name of a robot with a known order
+            (`go2`). `contact_order`, `sensor_order`: likewise.
+        joint_name: URDF name of the joint that the file calls {joint}, such as `{joint}_joint`.
+        contact_name: the same for {contact}.
+        plates: by pattern of the contact, pose of the force plate; `contact_wrench_world` and
+            `contact_wrench_point_world` are read in its axes, about its origin.
+        rows_of: the column with the joint's name, for a table with one row per joint and stamp; its other columns
+            are then `position.l_knee`, ...
+        episodes: for arrays, or groups of arrays, with several recordings.
+        ignore: columns that are not needed; * and ? stand for other letters.
     """
 
     time: Stamps | None = None
@@ -352,21 +351,21 @@ class Columns:
 
 
 def fits(name: str, pattern: str) -> bool:
-    """Whether a name fits a pattern, in which * and ? stand for other letters and brackets for themselves."""
+    """Whether a name fits a pattern; * and ? stand for other letters, brackets for themselves."""
     return fnmatchcase(name, pattern.replace("[", "[[]"))
 
 
 def letters_of(pattern: str) -> int:
-    """How much a pattern says: of several that a name fits, the one with most letters counts."""
+    """Number of fixed letters of a pattern: if a name fits several patterns, the one with the most letters counts."""
     return len(re.sub(r"[*?]", "", PLACEHOLDER.sub("", pattern)))
 
 
 def values_by_name(key: str, given: Mapping[str, _X], labels: Sequence[str]) -> dict[str, _X]:
-    """Values by name, of values by pattern: that with most letters counts.
+    """Values by name, from values by pattern; the pattern with the most letters counts.
 
     Raises:
-        ConfigError: two that say as much.
-        UnknownNameError: a pattern that no name fits.
+        ConfigError: two patterns with equally many letters have different values.
+        UnknownNameError: no name fits a pattern.
     """
     out: dict[str, tuple[int, _X]] = {}
     for pattern, value in given.items():
@@ -377,30 +376,30 @@ def values_by_name(key: str, given: Mapping[str, _X], labels: Sequence[str]) -> 
         for label in matching:
             most = out.get(label, (-1, value))
             if most[0] == letters and most[1] != value:
-                raise ConfigError.at_field(key, f"two values of {label}", "patterns of which one has more letters")
+                raise ConfigError.at_field(key, f"two values for {label}", "one value; the longer pattern counts")
             out[label] = max(most, (letters, value), key=lambda pair: pair[0])
     return {label: value for label, (_, value) in out.items()}
 
 
 def values_of_all(key: str, what: str, given: Mapping[str, _X], kind: str, labels: Sequence[str]) -> list[_X]:
-    """Values of all names, of values by pattern; errors as `values_by_name`, and ConfigError for a name without one."""
+    """Values of all names, from values by pattern; as `values_by_name`, and ConfigError for a name without a value."""
     values = values_by_name(key, given, labels)
     without = [label for label in labels if label not in values]
     if without:
-        raise ConfigError.at_field(key, f"no {what} of {without[0]}", f"one for every {kind}; * stands for all others")
+        raise ConfigError.at_field(key, f"no {what} for {without[0]}", f"one for every {kind}; * stands for all others")
     return [values[label] for label in labels]
 
 
 @dataclasses.dataclass(frozen=True)
 class EntryPart:
-    """A field of a log, or a part that it is computed from, as one entry gives it.
+    """One entry of a map: a field of a log, or a quantity from which a field is computed.
 
     Attributes:
         key: below `logs.columns`.
         entry: of the map.
         names_field: `joint_names`, ... or "" without names.
         components: `x`, ...; none for one number each.
-        quantities: by component that its unit may be of, as `quantities_of` says; of one number under "".
+        quantities: by component, the quantities of `quantities_of` for its unit; under "" without components.
         is_native: whether its columns have torchid's own names, without an entry in the map.
     """
 
@@ -418,7 +417,7 @@ class EntryPart:
 
     @property
     def where(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return self.key if self.is_native else f"{KEY}.{self.key}"
 
     @property
@@ -428,7 +427,7 @@ class EntryPart:
 
 
 def _part(key: str, field: str, entry: ColumnEntry) -> EntryPart:
-    """An entry that is like a field of a log."""
+    """An entry with the names, components and units of a field."""
     components = tuple(getattr(entry, "axes", None) or component_names(field))
     has_unit = not isinstance(entry, (FlagEntry, Gains))
     quantities = {name: quantities_of(field, name) if has_unit else () for name in components or ("",)}
@@ -478,34 +477,34 @@ _LAW = {
     "position": "joint_position", "velocity": "joint_velocity", "feed_forward": "joint_torque",
     "kp": "joint_torque", "kd": "joint_torque",
 }  # fmt: skip
-"""What the parts of a PD law are like."""
+"""Fields with the same names, components and units as the parts of a PD law."""
 
 
 # --------------------------------------------------------------------------------------------------- checks of a map
 
 
 def check_columns(columns: Columns) -> None:
-    """Check whatever of a map does not depend on a file.
+    """Check the parts of a map that do not depend on a file.
 
     Raises:
-        ConfigError: an entry without columns or with two kinds of them, a placeholder that stands for nothing, a name
-            twice in an order, a unit that is none.
+        ConfigError: an entry has no columns, or two kinds of them; a placeholder or a unit is unknown; an order has a
+            name twice.
     """
     for kind in KINDS.values():
         _check_order(f"{KEY}.{kind}_order", getattr(columns, f"{kind}_order"))
     for kind in ("joint", "contact"):
         if columns.name_of(kind).count(f"{{{kind}}}") != 1:
-            accepted = f"a pattern with {{{kind}}} once, such as {{{kind}}}_link"
+            accepted = f"a pattern with one {{{kind}}}, such as {{{kind}}}_link"
             raise ConfigError.at_field(f"{KEY}.{kind}_name", f"found '{excerpt(columns.name_of(kind))}'", accepted)
     times = [("other_times", entry) for entry in columns.other_times]
     for field, entry in (*((field, getattr(columns, field)) for field in columns.fields), *times):
         _check_given(field, entry)
     if columns.plates and columns.contact_wrench_world is None:
-        accepted = f"an entry of {WRENCHES[1]}, readings along the plates' axes, or no plates"
+        accepted = f"an entry {WRENCHES[1]} with the readings in the plates' axes, or no plates"
         raise ConfigError.at_field(f"{KEY}.plates", f"given without {KEY}.{WRENCHES[1]}", accepted)
     groups = None if columns.episodes is None else columns.episodes.groups
     if groups is not None and (groups.count("*") != 1 or (columns.episodes and columns.episodes.lengths)):
-        accepted = "a name with one * for the number of a group, such as data/demo_*, without lengths"
+        accepted = "a name with one * for the number, such as data/demo_*, and no lengths"
         raise ConfigError.at_field(f"{KEY}.episodes", f"groups: '{excerpt(groups)}'", accepted)
     for part in (*list_parts(columns).values(), *(_part(name, "time", entry) for name, entry in times)):
         _check_part(part)
@@ -515,23 +514,23 @@ def _check_order(key: str, order: list[str | None] | None) -> None:
     names = [name for name in order or () if name is not None]
     again = [name for name in names if names.count(name) > 1]
     if again:
-        raise ConfigError.at_field(key, f"'{excerpt(again[0])}' twice", "every name once, null for what is left out")
+        raise ConfigError.at_field(key, f"'{excerpt(again[0])}' twice", "every name once; null for an unused column")
     if order is not None and not names:
         raise ConfigError.at_field(key, "no name", "names in the order of the columns")
 
 
 _WAYS = ("column", "columns", "pd", "current", "always", "force", "step", "rpy")
-"""Keys of an entry of which one says where its numbers are."""
+"""Keys for the source of an entry's numbers; each entry has exactly one of them."""
 
 
 def _check_given(field: str, entry: ColumnEntry) -> None:
-    """Refuse an entry that says nothing, or the same in two ways."""
+    """Refuse an entry with no source of numbers, or with two."""
     key = f"{KEY}.{field}"
     given = [name for name in _WAYS if getattr(entry, name, None)]
     if not given and getattr(entry, "above", None) is not None:
         given = ["above"]
     if len(given) != 1:
-        reason = f"{' and '.join(given)} together" if given else "nothing that says where it is"
+        reason = f"{' and '.join(given)} together" if given else "has no column"
         raise ConfigError.at_field(key, reason, f"one of {', '.join(name for name in _WAYS if hasattr(entry, name))}")
     (way,) = given
     unsaid = (
@@ -543,7 +542,7 @@ def _check_given(field: str, entry: ColumnEntry) -> None:
     )
     beside = [name for name in unsaid if getattr(entry, name, None)] if way not in ("column", "columns") else []
     if beside:
-        reason = f"{beside[0]} beside {way}, which it says nothing about"
+        reason = f"{beside[0]} has no effect together with {way}"
         raise ConfigError.at_field(key, reason, f"{way} without {beside[0]}")
     if getattr(entry, "moment", None) is not None and way != "force":
         raise ConfigError.at_field(key, "moment without force", "force, with or without moment")
@@ -557,15 +556,15 @@ def _check_law(law: PdLaw) -> None:
     key = f"{KEY}.joint_torque.pd"
     if (law.kp is None) != (law.position is None):
         reason = "position without kp" if law.kp is None else "kp without position"
-        raise ConfigError.at_field(key, reason, "kp together with position, the desired one")
+        raise ConfigError.at_field(key, reason, "kp and the desired position together")
     if law.kd is None and (law.velocity is not None or law.kp is None):
         reason = "no gain" if law.velocity is None else "velocity without kd"
         raise ConfigError.at_field(key, reason, "kp with position, or kd with or without velocity, or both")
     for name in ("kp", "kd"):
         gains = getattr(law, name)
         if gains is not None and bool(gains.value) + bool(gains.column) + bool(gains.columns) != 1:
-            accepted = "a number, numbers by joint, or a column or an array"
-            raise ConfigError.at_field(f"{key}.{name}", "not one of value, column and columns", accepted)
+            accepted = "a number, numbers by joint, a column or an array"
+            raise ConfigError.at_field(f"{key}.{name}", "needs exactly one of value, column and columns", accepted)
 
 
 def _check_part(part: EntryPart) -> None:
@@ -577,12 +576,12 @@ def _check_part(part: EntryPart) -> None:
     _check_order(f"{key}.order", entry.order)
     for text in part.patterns:
         if text == FILL_IN:
-            accepted = "a name of a column, or a pattern; torchid init lists what the file has below its map"
-            raise ConfigError.at_field(key, f"{FILL_IN}, which is to be filled in", accepted)
+            accepted = "the name of a column, or a pattern; torchid init lists all columns below its map"
+            raise ConfigError.at_field(key, f"still {FILL_IN}", accepted)
         _check_pattern(key, part, text)
     if entry.columns and not part.kind and set(entry.columns) != set(part.components):
         reason = f"components {', '.join(entry.columns)}"
-        accepted = f"each of {', '.join(part.components)}" if part.components else "column, as it is one number"
+        accepted = f"all of {', '.join(part.components)}" if part.components else "column: this is one number"
         raise ConfigError.at_field(f"{key}.columns", reason, accepted)
     quantities = tuple(dict.fromkeys(quantity for given in part.quantities.values() for quantity in given))
     for unit in entry.unit.values():
@@ -594,19 +593,19 @@ def _check_pattern(key: str, part: EntryPart, text: str) -> None:
     names = [name for name, _ in PLACEHOLDER.findall(text)]
     wrong = [name for name in names if name not in allowed or names.count(name) > 1]
     if wrong or len({part.kind, "index"} & set(names)) > 1 or len(set(names) & set(AXES)) > 1:
-        accepted = f"at most one each of {', '.join(f'{{{x}}}' for x in allowed)}, and one of them for the names"
+        accepted = f"at most one of each: {', '.join(f'{{{x}}}' for x in allowed)}"
         raise ConfigError.at_field(key, f"{{{(wrong or names)[0]}}} in '{excerpt(text)}'", accepted)
 
 
 def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> None:
-    """Make sure that all names which a map states are those of a robot.
+    """Check that the robot has all names in a map.
 
     Args:
         columns: the map.
         known: names by their kind: joint, contact.
 
     Raises:
-        InputError: one that is not.
+        InputError: the robot has no such name.
     """
     if (robot := robot_with_order(columns.joint_order)) and "joint" in known:
         require_joints_of(f"{KEY}.joint_order", robot, known["joint"])
@@ -621,16 +620,16 @@ def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> Non
         given = [name for name in names if name is not None]
         unknown = [name for name in given if kind in known and name not in known[kind]]
         if len(unknown) > 1 and unknown == given:
-            reason = f"none of {join_names(given)} is a {kind} of the robot; is it the one that was recorded?"
+            reason = f"the robot has no {kind} {join_names(given)}. Is it the recorded robot?"
             raise ConfigError.at_field(f"{KEY}.{key}", reason, f"names of the robot: {join_names(list(known[kind]))}")
         if unknown:
             raise UnknownNameError.at_field(f"{KEY}.{key}", unknown[0], known[kind])
 
 
 def as_in_file(value: Any, file: str, others: Collection[str] = ()) -> Any:
-    """A map, or a part of one, with the names of a file's columns without that of the file before them.
+    """A map, or a part of one, for one file: without the file's name before its columns.
 
-    Of columns by name, such as `{l_foot: "left.csv::f{axis}", r_foot: "right.csv::f{axis}"}`, those of the file alone,
+    Columns by name, such as `{l_foot: "left.csv::f{axis}", r_foot: "right.csv::f{axis}"}`, keep only those of the file,
     if it has any; `others`: the names of all files.
     """
     if isinstance(value, str):

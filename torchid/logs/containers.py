@@ -63,8 +63,8 @@ def existing_log_kind(path: Path, beside: Path | None = None) -> LogKind:
     if part.joins:
         for number, file in enumerate(part.files):
             if existing_log_kind(file.path, part.files[0].path.parent if number else None) is LogKind.BAG:
-                accepted = f"{', '.join(WRITABLE)}: the topics of a bag have common stamps already; or convert it"
-                raise LogError(file.path, "file", "a bag, one of several files of a log", accepted)
+                accepted = f"a bag alone, or {', '.join(WRITABLE)}; torchid convert writes these"
+                raise LogError(file.path, "file", "a bag in a log of several files", accepted)
         return LogKind.JOINED
     path = part.file
     if os.path.isdir(path):  # Path.is_dir raises where a name is too long
@@ -74,7 +74,7 @@ def existing_log_kind(path: Path, beside: Path | None = None) -> LogKind:
     kind = _kind(path, READABLE)
     if not os.path.isfile(path):
         reason = "a pipe, a device or a socket" if os.path.exists(path) else "no such file"
-        where = f"; later files of a log are looked for from the folder of the first, {beside}" if beside else ""
+        where = f"; paths of further files are relative to {beside}" if beside else ""
         raise LogError(path, "file", reason, f"an existing log ({', '.join(READABLE)}){where}")
     return kind
 
@@ -106,7 +106,7 @@ def _suffix(path: Path, accepted: tuple[str, ...]) -> str:
     """A file's extension in small letters, LogError unless it is one of these."""
     suffix = path.suffix.lower()
     if suffix not in accepted:
-        one_array = f"; of an array x numpy.savez('{path.stem}.npz', x=x)" if suffix == ".npy" else ""
+        one_array = f"; convert an array x with numpy.savez('{path.stem}.npz', x=x)" if suffix == ".npy" else ""
         raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(accepted) + one_array)
     return suffix
 

@@ -75,12 +75,12 @@ class CutoffChoice:
 
     def __str__(self) -> str:
         if self.limit_hz is not None:
-            return f"{self.cutoff_hz:g} Hz: a fit to more, up to {self.limit_hz:g} Hz, predicts this band worse"
+            return f"{self.cutoff_hz:g} Hz; a higher one, up to {self.limit_hz:g} Hz, predicts this band worse"
         if self.cutoff_hz is None:
             return "none: accelerations were recorded"
         if self.by_noise:
-            return f"{self.cutoff_hz:g} Hz, by the noise of motion that goes up to {self.motion_hz:g} Hz"
-        return f"{self.cutoff_hz:g} Hz, the usual one: no log shows noise of the motion that would bound it"
+            return f"{self.cutoff_hz:g} Hz, from the noise; the motion reaches {self.motion_hz:g} Hz"
+        return f"{self.cutoff_hz:g} Hz, the default: the logs show no noise of the motion"
 
 
 def usual_cutoff_hz(sample_rate_hz: float) -> float:
@@ -117,7 +117,7 @@ def choose_cutoff(
         return CutoffChoice(None, by_noise=False)
     steps = [float(np.median(np.diff(log.time))) for log in derived]
     if (step := max(steps)) > LONGEST_MEDIAN_STEP:
-        accepted = f"steps of at most {LONGEST_MEDIAN_STEP:g} s, or another unit in logs.columns.time"
+        accepted = f"steps of at most {LONGEST_MEDIAN_STEP:g} s, or the right unit in logs.columns.time"
         raise LogError(derived[steps.index(step)].source, "time", f"a median step of {step:.3g} s", accepted)
     slowest = 1.0 / step
     slowest = slowest if sample_rate_hz is None else min(slowest, sample_rate_hz)

@@ -146,7 +146,7 @@ def with_sign_filter(timeline: Timeline, log: Log, noise: SignalNoise) -> Timeli
     if wider is not None:
         if wider.lost > _MUCH:
             with about_file(log.source):
-                warn_about_file(f"joints move faster than the filter lets through: {wider}")
+                warn_about_file(str(wider))
         timeline = replace(timeline, sign_low_pass=wider.low_pass)
         step = float(np.median(np.diff(log.time)))
         derivatives = noise_of_derivatives(step, replace(timeline, low_pass=wider.low_pass))
@@ -204,11 +204,9 @@ class WiderLowPass:
     lost: float
 
     def __str__(self) -> str:
-        """What is lost, what follows and what helps."""
-        return (
-            f"{100.0 * self.lost:.0f} % of the power of their velocities is taken off, with whose squares forces go,"
-            f" measured and fitted ones; accepted: preprocessing.cutoff_hz of {self.cutoff_hz:.3g} or more"
-        )
+        """The lost share, and the cutoff that keeps it."""
+        lost = f"the filter removes {100.0 * self.lost:.0f} % of the power of joint velocities"
+        return f"{lost}; set preprocessing.cutoff_hz to {self.cutoff_hz:.3g} or more"
 
 
 def wider_low_pass(log: Log, timeline: Timeline) -> WiderLowPass | None:

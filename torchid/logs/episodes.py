@@ -46,8 +46,10 @@ class EpisodeArrays:
     def _find_groups(self, pattern: str) -> None:
         self._groups = groups_of(self.names, pattern)
         if not self._groups:
-            accepted = f"a name with * for the number, of groups that hold the same arrays: {excerpt(self.names[0])}"
-            raise LogError.at_field(f"{KEY}.episodes.groups", f"'{excerpt(pattern)}', no such groups", accepted)
+            accepted = (
+                f"a name with * for the number, of groups with the same arrays; an array: {excerpt(self.names[0])}"
+            )
+            raise LogError.at_field(f"{KEY}.episodes.groups", f"no groups '{excerpt(pattern)}'", accepted)
         regex = in_groups(pattern)
         self.names = [*self._groups, *(x for x in self.names if not regex.fullmatch(x) and x not in self._groups)]
 
@@ -56,7 +58,7 @@ class EpisodeArrays:
         array = self._load(name)
         if array.ndim < 2:
             reason = f"axis: {entry.axis}, but '{excerpt(name)}' has shape {array.shape}"
-            raise LogError.at_field(f"{KEY}.episodes", reason, "arrays (episodes, samples, ...) or the other way round")
+            raise LogError.at_field(f"{KEY}.episodes", reason, "(episodes, samples, ...) or (samples, episodes, ...)")
         self._axis = entry.axis
         self._shape = (int(array.shape[0]), int(array.shape[1]))
         count = self._shape[entry.axis]
@@ -66,7 +68,7 @@ class EpisodeArrays:
             lengths = self._load(entry.lengths).ravel() if entry.lengths in self.names else np.empty(0)
             is_whole = lengths.dtype.kind in "iu" and lengths.shape == (count,)
             if not is_whole or ((lengths < 1) | (lengths > samples)).any():
-                accepted = f"an array of {count} whole numbers, the samples of each, from 1 to {samples}"
+                accepted = f"an array of {count} integers, the samples of each episode, from 1 to {samples}"
                 raise LogError.at_field(f"{KEY}.episodes.lengths", f"'{excerpt(entry.lengths)}'", accepted)
         self._lengths = lengths.astype(np.int64).tolist()
 
@@ -93,8 +95,8 @@ class EpisodeArrays:
             return parts[0]
         for part, text in zip(parts, names, strict=True):
             if not part.ndim or part.shape[1:] != parts[0].shape[1:]:
-                others = f"shape {part.shape}, but '{excerpt(names[0])}' {parts[0].shape}"
-                accepted = "as many columns in all groups; leave other groups out of the file"
+                others = f"shape {part.shape}, but '{excerpt(names[0])}' has {parts[0].shape}"
+                accepted = "equally many columns in all groups; remove other groups from the file"
                 raise LogError.at_field(f"'{excerpt(text)}'", others, accepted)
         if not parts[0].dtype.hasobject:
             self._counts[sum(map(len, parts))] = [len(part) for part in parts]
@@ -133,5 +135,5 @@ def _positions(columns: Columns, names: Collection[str]) -> str:
     regex = re.compile(".+".join(map(re.escape, re.split(PLACEHOLDER.pattern, text)[::3])) + r"(\[.*\]|\.T)?")
     name = next((x for x in names if x == text or text.startswith(f"{x}[") or regex.fullmatch(x)), None)
     if name is None:
-        raise LogError.at_field(f"{KEY}.episodes", "given without positions of joints", f"{KEY}.joint_position too")
+        raise LogError.at_field(f"{KEY}.episodes", "given without joint positions", f"{KEY}.joint_position")
     return name

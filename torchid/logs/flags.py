@@ -52,7 +52,7 @@ def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, Bool
             continue
         if missing.any():
             reason = f"nan at {describe_element((int(np.argmax(missing)), column), log.contact_names)}"
-            accepted = f"forces to compare with {_KEY}, or gaps that preprocessing.bridge_gaps_s bridges"
+            accepted = f"forces to compare with {_KEY}, or preprocessing.bridge_gaps_s to bridge gaps"
             if missing.all():
                 reason = f"no force of {name}"
                 accepted = f"forces to compare with {_KEY}, or contact_active"

@@ -66,7 +66,7 @@ def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dic
             filled[name] = np.asarray(short.reshape(len(time), -1).any(axis=1))
     if filled:
         count = int(np.any(list(filled.values()), axis=0).sum())
-        what = f"gaps of at most {longest_s:g} s bridged in {count} of {len(time)} samples"
+        what = f"gaps of up to {longest_s:g} s were bridged in {count} of {len(time)} samples"
         warn_about_file(f"{', '.join(filled)}: {what}")
     return out
 
@@ -80,8 +80,8 @@ def refuse_gaps(name: str, values: FloatArray, time: FloatArray, labels: tuple[s
         for start, stop in runs(column)
         if start > 0 and stop < len(time)
     ]
-    longest = f"the longest here takes {max(lengths):.3g} s" if lengths else "none here has values on both sides"
-    raise LogError.at_field(name, f"nan at {where}", f"finite numbers, or gaps that {_KEY} bridges ({longest})")
+    longest = f"the longest is {max(lengths):.3g} s" if lengths else "no gap has values on both sides"
+    raise LogError.at_field(name, f"nan at {where}", f"finite numbers, or {_KEY} to bridge gaps ({longest})")
 
 
 def _with_gaps(raw: Mapping[str, NDArray[Any]]) -> Iterator[str]:
@@ -188,7 +188,7 @@ def require_no_turns(log: Log) -> None:
     first = log.time[1 + int(jumps.any(axis=1).argmax())]
     names = join_names([log.joint_names[joint] for joint in joints])
     reason = f"{names} jumps by a whole turn, {format_count(int(jumps.sum()), 'time')}, first at {first:.6g} s"
-    accepted = "angles without jumps: logs.columns.joint_position.turn_from, or unwrap them"
+    accepted = "unwrapped angles, or logs.columns.joint_position.turn_from"
     raise LogError(log.source, "joint_position", reason, accepted)
 
 
@@ -221,8 +221,8 @@ def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
         label = describe_element((0, *channel), labels).partition(", ")[2]
         broken.append(f"{label} (samples {samples[0]} to {samples[-1]})")
     if broken:
-        message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
-        message += f", unless {_KEY} bridges these gaps or preprocessing.exclude_rejected leaves them out"
+        message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: preprocessing makes all samples NaN"
+        message += f". Set {_KEY} to bridge the gaps, or preprocessing.exclude_rejected: true"
         warn(message)
 
 

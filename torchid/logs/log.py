@@ -333,7 +333,7 @@ def check_finite(name: str, values: FloatArray, *, allow_nan: bool = False, labe
     if bad.any():
         index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
         accepted = f"numbers of at most {LARGEST:g}" if np.isfinite(values[index]) else "finite numbers"
-        accepted += ", or NaN where nothing was measured" if allow_nan else ""
+        accepted += ", or NaN for missing values" if allow_nan else ""
         where = describe_element(index, labels, "xyz" if name in (NORMALS, POINTS) else WRENCH_COMPONENTS)
         raise LogError.at_field(name, f"{values[index]} at {where}", accepted)
 
@@ -347,8 +347,8 @@ def check_time(time: FloatArray) -> None:
     if not_increasing.any():
         i = int(np.argmax(not_increasing))
         reason = f"{time[i + 1]} at sample {i + 1}, after {time[i]} at sample {i}"
-        several = "; of recordings one after the other (episodes) the name with [#0] for the first, or [#0:8]"
-        coarse = "; where rows are steps of a clock that stamps round, logs.columns.time: {step: ...}"
+        several = "; for several recordings (episodes) add [#0] or [#0:8] to the file name"
+        coarse = "; for a constant step set logs.columns.time: {step: ...}"
         accepted = "strictly increasing seconds" + (several if time[i + 1] < time[i] else coarse)
         raise LogError.at_field("time", reason, accepted)
 
@@ -373,7 +373,7 @@ def normalize_quaternions(name: str, quat: FloatArray, allow_nan: bool = False) 
     if bad.any():
         i = int(np.argmax(bad))
         reason = f"norm {norm[i]:.6g} at sample {i}"
-        raise LogError.at_field(name, reason, f"unit quaternions, to {NORM_TOLERANCE:g}")
+        raise LogError.at_field(name, reason, f"unit quaternions, within {NORM_TOLERANCE:g}")
     norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0  # normalised quaternions stay bit for bit
     return np.asarray(quat / norm[:, None], dtype=np.float64)
 
@@ -390,7 +390,7 @@ def normalize_normals(normals: FloatArray, active: BoolArray, labels: tuple[str,
     if bad.any():
         sample, contact = (int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
         reason = f"norm {norm[sample, contact]:.6g} at {describe_element((sample, contact), labels)}, while in contact"
-        raise LogError.at_field(NORMALS, reason, f"unit vectors, to {NORM_TOLERANCE:g}")
+        raise LogError.at_field(NORMALS, reason, f"unit vectors, within {NORM_TOLERANCE:g}")
     norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0
     return np.where(known[..., None], normals / np.where(known, norm, 1.0)[..., None], np.nan)
 

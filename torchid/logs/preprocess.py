@@ -221,8 +221,8 @@ def _orientation(log: Log, derivatives: list[FloatArray], timeline: Timeline) ->
     q, *rates = derivatives
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     if timeline.low_pass is not None and np.min(norm) < _MIN_QUATERNION_NORM:
-        reason = f"a cutoff that removes the base's rotation (norm of the filtered quaternion {np.min(norm):.2g})"
-        raise InputError(log.source, "preprocessing.cutoff_hz", reason, "a cutoff above the rate of that rotation")
+        reason = f"the filter removes the base's rotation (norm of the filtered quaternion {np.min(norm):.2g})"
+        raise InputError(log.source, "preprocessing.cutoff_hz", reason, "a cutoff above the frequency of this rotation")
     out = {"base_quat_xyzw": q / norm}
     if rates:
         out["base_angular_velocity_base"] = angular_velocity_base(q, rates[0])

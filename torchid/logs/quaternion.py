@@ -42,7 +42,7 @@ def require_unit(topic: str, quat: FloatArray, key: str) -> FloatArray:
         norm = np.linalg.norm(quat, axis=1)
         bad = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
     if bad.any():
-        reason = f"a quaternion of the IMU of norm {norm[bad][0]:.4g}"
+        reason = f"an IMU quaternion has norm {norm[bad][0]:.4g}"
         raise LogError.at_field(topic, reason, f"unit quaternions, or {key}.orientation: false")
     return quat
 

@@ -249,7 +249,7 @@ def _cut(raw: dict[str, NDArray[Any]], range_: TimeRange | Recording) -> dict[st
     for name, array in raw.items():
         if field_shape(name)[:1] == ("N",):
             if array.shape[:1] != time.shape:
-                raise LogError.at_field(name, f"shape {array.shape}", f"{len(time)} samples, as time has")
+                raise LogError.at_field(name, f"shape {array.shape}", f"{len(time)} samples, as in time")
             out[name] = array[samples]
     return out
 
@@ -312,13 +312,13 @@ def _check_combination(names: Collection[str], needs_flags: bool) -> None:
     for name, required in REQUIRED_WITH.items():
         missing = [field for field in required if field not in names and (needs_flags or field != FLAGS)]
         if name in names and missing:
-            accepted = f"{name} together with {missing[0]}"
+            accepted = f"{missing[0]} in the log"
             if missing[0] == FLAGS and name in CONTACT_READINGS:
-                accepted += ", or flags by preprocessing.contact_threshold in an experiment file"
+                accepted += ", or preprocessing.contact_threshold in an experiment file"
             raise LogError.at_field(name, f"given without {missing[0]}", accepted)
     for name, canonical in VARIANTS.items():
         if name in names and not is_quaternion(name) and not any(map(is_quaternion, names)):
-            accepted = f"with base_quat_wxyz or base_quat_xyzw, or as {canonical}"
+            accepted = f"base_quat_wxyz or base_quat_xyzw in the log, or {canonical}"
             raise LogError.at_field(name, "given without the base's orientation", accepted)
 
 

@@ -239,12 +239,12 @@ def check_topics(topics: Topics, needs_flags: bool = True) -> None:
         raise ConfigError.at_field("logs.topics.other_joint_states", "given without joint_states", "both, or neither")
     given = [name for topic in topics.joint_topics.values() for name in topic.names.values()]
     if again := [name for name in given if given.count(name) > 1]:
-        reason = f"two names of '{excerpt(again[0])}'"
-        raise ConfigError.at_field("logs.topics.joint_states.names", reason, "each joint of the robot once")
+        reason = f"two names for '{excerpt(again[0])}'"
+        raise ConfigError.at_field("logs.topics.joint_states.names", reason, "each joint of the robot at most once")
     for name, contact in topics.contact_active.items():
         if (contact.topic is None) != contact.always:
-            accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"
-            raise ConfigError.at_field(f"logs.topics.contact_active.{name}", "not one of topic and always", accepted)
+            accepted = "a topic of std_msgs/Bool, or true for a contact that is always active"
+            raise ConfigError.at_field(f"logs.topics.contact_active.{name}", "needs either topic or always", accepted)
     if needs_flags:
         _check_flags(topics)
     stamped = [role for role in topics.by_role if not role.startswith("contact_active.")]
@@ -261,11 +261,11 @@ def _check_flags(topics: Topics) -> None:
     unflagged = [name for name in topics.contacts if name not in topics.contact_active and name not in by_count]
     counted = [name for name in unflagged if name in topics.feet]
     if counted:
-        reason = f"missing, though nothing else says when {counted[0]} touches"
+        reason = f"missing: no contact flags for {counted[0]}"
         accepted = f"a reading [counts], {_OTHER_FLAGS}"
         raise ConfigError.at_field("logs.topics.low_state.above", reason, accepted)
     if unflagged and topics.contact_force_threshold is None:
-        reason = f"missing, though nothing else says when {unflagged[0]} touches"
+        reason = f"missing: no contact flags for {unflagged[0]}"
         accepted = f"a force [N], {_OTHER_FLAGS}"
         raise ConfigError.at_field("logs.topics.contact_force_threshold", reason, accepted)
 
@@ -275,7 +275,7 @@ def _check_low_state(topics: Topics, low_state: LowStateTopic) -> None:
     key = "logs.topics.low_state"
     if (low_state.robot is None) == (low_state.joints is None):
         reason = "neither robot nor joints" if low_state.robot is None else "robot and joints together"
-        accepted = f"one of the two: robot ({', '.join(JOINT_ORDERS)}), or joints by number of the motor"
+        accepted = f"one of the two: robot ({', '.join(JOINT_ORDERS)}), or joints by motor number"
         raise ConfigError.at_field(key, reason, accepted)
     if low_state.robot is not None and low_state.robot not in JOINT_ORDERS:
         raise UnknownNameError.at_field(f"{key}.robot", low_state.robot, JOINT_ORDERS)
@@ -284,25 +284,25 @@ def _check_low_state(topics: Topics, low_state: LowStateTopic) -> None:
         again = [name for name in names if names.count(name) > 1]
         if again or (given and not names):
             reason = f"'{excerpt(again[0])}' twice" if again else "no name"
-            raise ConfigError.at_field(f"{key}.{name}", reason, "every name once, null for what is left out")
+            raise ConfigError.at_field(f"{key}.{name}", reason, "every name once; null for an unused motor")
     if low_state.feet is not None and not low_state.reads_feet:
-        accepted = "above, the reading from which on a foot touches, or forces: true"
-        raise ConfigError.at_field(f"{key}.feet", "given, though nothing reads them", accepted)
+        accepted = "above (the reading at which a foot touches) or forces: true"
+        raise ConfigError.at_field(f"{key}.feet", "given, but above and forces are missing", accepted)
     robot = JOINT_ORDERS.get(low_state.robot or "")
     if low_state.reads_feet and robot is not None and robot.message != GO:
         reading = "forces" if low_state.forces else "above"
-        reason = f"'{low_state.robot}', which sends {robot.message} without foot sensors, though {reading} is set"
+        reason = f"'{low_state.robot}' sends {robot.message} without foot sensors, but {reading} is set"
         others = ", ".join(name for name, order in JOINT_ORDERS.items() if order.message == GO)
-        accepted = f"a robot that sends {GO} ({others}), if the messages are of one, or no {reading}"
+        accepted = f"a robot that sends {GO} ({others}), or no {reading}"
         raise ConfigError.at_field(f"{key}.robot", reason, accepted)
     if low_state.reads_feet and not low_state.feet_by_number:
-        reason = "missing, though the foot sensors are read"
-        raise ConfigError.at_field(f"{key}.feet", reason, "contacts by number in foot_force, null for what is left out")
+        reason = "missing, but foot sensors are read"
+        raise ConfigError.at_field(f"{key}.feet", reason, "contacts by number in foot_force; null for an unused sensor")
     if topics.imu is not None and low_state.frame is not None:
-        raise ConfigError.at_field("logs.topics.imu", f"set beside {key}.frame", "one IMU, that of the base")
+        raise ConfigError.at_field("logs.topics.imu", f"set together with {key}.frame", "one IMU, on the base")
     twice = [name for name in topics.contact_force_normal if low_state.forces and name in topics.feet]
     if twice:
-        reason = f"set, though {key}.forces is its force too"
+        reason = f"set together with {key}.forces"
         raise ConfigError.at_field(f"logs.topics.contact_force_normal.{twice[0]}", reason, "one of the two")
 
 

@@ -1,6 +1,6 @@
-"""The fields of a log from the named columns or arrays of a file, by a map of these: names, orders, units, formulas.
+"""Read the fields of a log from named columns or arrays with a map: names, orders, units, formulas.
 
-Columns with torchid's own names (`joint_position.l_knee`) are entries of a map that nobody has to write.
+Columns with torchid's own names (`joint_position.l_knee`) need no entry in the map.
 """
 
 from __future__ import annotations
@@ -71,12 +71,12 @@ class Matched:
     """The columns of one entry of a map.
 
     Attributes:
-        part: what they make up.
-        labels: names of joints (contacts, sensors) in the order of the columns, or of those of an array; None for one
-            that is left out. Empty without names.
-        columns: in the order of names, then of components; a single one is an array of what is not split.
-        by_name: whether every name has a column of its own.
-        by_component: whether every component has.
+        part: the entry.
+        labels: names of joints (contacts, sensors) in the order of the columns, or of an array's columns; None for an
+            unused column. Empty without names.
+        columns: in the order of names, then of components; a single array if these are not split.
+        by_name: whether every name has its own column.
+        by_component: whether every component has its own column.
     """
 
     part: EntryPart
@@ -92,11 +92,11 @@ class Matched:
 
 
 class _Search:
-    """The columns of a file, and which entries of a map they fit.
+    """The columns of a file, and the entries of a map that they fit.
 
     Attributes:
-        left_out: columns of numbers that are no joint of the robot.
-        finds_any: whether any column of the entries is there.
+        left_out: numbered columns without a joint of the robot.
+        finds_any: whether the file has any column of the entries.
     """
 
     def __init__(
@@ -119,11 +119,11 @@ class _Search:
         self.finds_any = any(self._found.values()) or not set(given).isdisjoint(listed)
 
     def match(self, part: EntryPart) -> Matched:
-        """The columns of an entry; LogError where some are missing."""
+        """The columns of an entry; LogError if some are missing."""
         matched = self._stated.get(part.key) or self._by_names_in_columns(part)
         missing = [column for column in matched.columns if column not in self._known]
         if missing:
-            more = f" (nor {len(missing) - 1} more)" if len(missing) > 1 else ""
+            more = f" ({len(missing) - 1} more are missing)" if len(missing) > 1 else ""
             raise UnknownFieldError.at_field(part.where, missing[0], self._unused(), f"no such column{more}")
         return matched
 
@@ -132,7 +132,7 @@ class _Search:
         return [text for text in self._given if text not in taken] or list(self._given)
 
     def _by_stated_names(self, part: EntryPart) -> Matched | None:
-        """The columns of an entry whose names the map or the file states; None for names that columns alone have."""
+        """The columns of an entry with names stated by the map or the file; None if only its columns state names."""
         entry = part.entry
         text = entry.column or ""
         holders = {name for name, _ in PLACEHOLDER.findall(text)}
@@ -173,28 +173,28 @@ class _Search:
             return Matched(part, (), tuple(entry.columns[x] for x in part.components), False, True)
         splits = {_splits(part, text) for text in entry.columns.values()}
         if len(splits) > 1:
-            reason = "patterns of components beside other names"
+            reason = "only some columns have {axis}"
             raise ConfigError.at_field(f"{part.where}.columns", reason, "{axis} in all or in none")
         listed = enumerate(entry.columns.items(), entry.first_index)
         columns = tuple(column for k, (name, text) in listed for column in _spell(part, text, k, name))
         return Matched(part, tuple(entry.columns), columns, True, splits.pop())
 
     def _around_name(self, part: EntryPart) -> tuple[str, str]:
-        """What the URDF's names have before and after those of the file."""
+        """The parts of the URDF's names before and after the file's names."""
         pattern = "" if part.is_native else self._columns.name_of(part.kind)
         before, _, after = pattern.partition(f"{{{part.kind}}}")
         return before, after
 
     def _stem(self, part: EntryPart, name: str) -> str:
-        """What a file calls a joint or contact."""
+        """The file's name of a joint or contact."""
         before, after = self._around_name(part)
         if not name.startswith(before) or not name.endswith(after) or len(name) <= len(before) + len(after):
-            reason = f"'{self._columns.name_of(part.kind)}', which '{excerpt(name)}' is no example of"
-            raise ConfigError.at_field(f"{KEY}.{part.kind}_name", reason, f"a pattern of all names of {part.kind}s")
+            reason = f"'{excerpt(name)}' does not fit the pattern '{self._columns.name_of(part.kind)}'"
+            raise ConfigError.at_field(f"{KEY}.{part.kind}_name", reason, f"a pattern that fits all {part.kind} names")
         return name[len(before) : len(name) - len(after)]
 
     def _assign(self) -> dict[str, list[str]]:
-        """The names in columns, by entry of those whose names columns alone have: that with most letters has it."""
+        """The names in columns, by entry without stated names; the pattern with the most letters gets a column."""
         stated = {column for matched in self._stated.values() for column in matched.columns} | self.left_out
         regexes = {key: column_pattern(part, part.entry.column or "") for key, part in self._free.items()}
         out = defaultdict[str, list[str]](list)
@@ -210,16 +210,16 @@ class _Search:
             best = [key for key in names if letters[key] == most]
             if len(best) > 1:
                 both = f"the patterns of {KEY}.{best[0]} and {KEY}.{best[1]}"
-                raise LogError.at_field(f"column '{text}'", f"fits {both}", "one that has more letters than the other")
+                raise LogError.at_field(f"column '{text}'", f"fits {both}", "patterns of which only one fits")
             out[best[0]].append(names[best[0]])
         return out
 
     def _by_names_in_columns(self, part: EntryPart) -> Matched:
-        """An entry whose names are those in its columns, in their order."""
+        """An entry with the names in its columns, in the order of these."""
         text = part.entry.column or ""
         stems = dict.fromkeys(self._found[part.key])
         if not stems:
-            reason = f"no column that fits '{excerpt(text)}'"
+            reason = f"no column fits '{excerpt(text)}'"
             raise LogError.at_field(part.where, reason, join_names(self._unused(), MOST_LISTED))
         columns = tuple(column for stem in stems for column in _spell(part, text, 0, stem))
         before, after = self._around_name(part)
@@ -257,7 +257,7 @@ _NATIVE = {field: column_pattern(native_part(field), native_part(field).entry.co
 
 
 def native_field(column: str) -> str:
-    """The field whose columns in a table have such a name, "" for none, and for one with a unit behind it."""
+    """The field of a column with a name of the log format; "" for other names, and for a name with a unit."""
     field = column.partition(".")[0]
     is_native = field in _NATIVE and _NATIVE[field].fullmatch(column) and not _UNIT.search(column)
     return field if is_native else ""
@@ -267,10 +267,10 @@ def native_field(column: str) -> str:
 
 
 class EntryReader:
-    """How the numbers of an entry come from its columns: their order, units, signs and turns."""
+    """Reads the numbers of an entry from its columns: order, units, signs and turns."""
 
     def __init__(self, matched: Matched, names: Sequence[str]) -> None:
-        """For names in the order of the log; ConfigError for a unit of another quantity."""
+        """Take the names in the order of the log; ConfigError for a unit of another quantity."""
         self.matched = matched
         part = matched.part
         places = {label: place for place, label in enumerate(matched.labels)}
@@ -280,17 +280,17 @@ class EntryReader:
         self._turns = _joint_turns(part, names) if isinstance(part.entry, AngleEntry) else None
 
     def read(self, take: Take) -> FloatArray:
-        """The numbers (N, ...), or of gains that hold throughout (1, ...); a joint without a column is NaN.
+        """The numbers (N, ...), or (1, ...) for constant gains; a joint without a column is NaN.
 
         Raises:
-            LogError: a column of another shape or of no numbers.
+            LogError: a column has another shape, or no numbers.
         """
         matched = self.matched
         part = self.matched.part
         arrays = [self._numbers(column, take(column)) for column in matched.columns]
         for column, array in zip(matched.columns, arrays, strict=True):
             if len(array) != len(arrays[0]):
-                accepted = f"{len(arrays[0])}, as '{matched.columns[0]}' has"
+                accepted = f"{len(arrays[0])}, as in '{matched.columns[0]}'"
                 raise LogError.at_field(f"'{column}'", f"{len(array)} samples", accepted)
         if not matched.by_name and not matched.by_component:
             out = arrays[0]
@@ -335,9 +335,7 @@ class EntryReader:
         width = array.shape[1] if names and array.ndim > 1 else 0
         unnamed = 0 < width < len(matched.labels) and not any(matched.labels[width:])  # null at the end of an order
         if array.shape[1:] != shape and not (unnamed and array.shape[2:] == shape[1:]):
-            of_names = (
-                f", one for each name of its order ({matched.labels[0]}, ...)" if matched.labels and shape else ""
-            )
+            of_names = f", one per name of its order ({matched.labels[0]}, ...)" if matched.labels and shape else ""
             turned = f"; '{column}.T' if its columns are the samples" if array.shape[:1] == shape else ""
             accepted = f"{_n_by(shape)}{of_names}{turned}"
             raise LogError.at_field(f"'{column}'", f"shape {_n_by(array.shape[1:])}", accepted)
@@ -349,7 +347,7 @@ def _n_by(shape: tuple[int, ...]) -> str:
 
 
 def _flags_of_words(column: str, array: NDArray[Any]) -> FloatArray:
-    """Numbers of words that mean whether a contact touches, NaN for empty cells; LogError for other words."""
+    """Contact flags from words: 1, 0, or NaN for empty cells; LogError for unknown words."""
     words, codes = np.unique(array, return_inverse=True)
     numbers = []
     for word in words.tolist():
@@ -362,13 +360,13 @@ def _flags_of_words(column: str, array: NDArray[Any]) -> FloatArray:
 
 
 def _element_labels(part: EntryPart, names: Sequence[str]) -> list[tuple[str, str]]:
-    """The elements of a sample as patterns of units fit them (`l_foot.fx`), and the component of each."""
+    """Labels of the elements of a sample for patterns of units (`l_foot.fx`), and their components."""
     of_names = names if part.kind else ("",)
     return [(".".join(filter(None, (name, axis))), axis) for name in of_names for axis in part.components or ("",)]
 
 
 def _element_factors(part: EntryPart, names: Sequence[str]) -> FloatArray | None:
-    """What the elements of a sample are multiplied by, (n,), (k,) or (n, k); None where that is 1."""
+    """Factors of the elements of a sample, (n,), (k,) or (n, k); None if all are 1."""
     entry = part.entry
     if not entry.unit and not entry.scale:
         return None
@@ -385,7 +383,7 @@ def _element_factors(part: EntryPart, names: Sequence[str]) -> FloatArray | None
 
 
 def _joint_turns(part: EntryPart, names: Sequence[str]) -> tuple[FloatArray, FloatArray] | None:
-    """Where the turn of each joint begins, NaN for one that is taken as it is, and how much a turn is, each (n,)."""
+    """Start of each joint's turn, NaN for joints without one, and the size of a turn, each (n,)."""
     given = getattr(part.entry, "turn_from", {})
     if not given:
         return None
@@ -401,13 +399,13 @@ def _joint_turns(part: EntryPart, names: Sequence[str]) -> tuple[FloatArray, Flo
 
 @dataclass(frozen=True)
 class FileFields:
-    """The fields of a file by a map of its columns or arrays.
+    """The fields of a file, by a map of its columns or arrays.
 
     Attributes:
         names: of joints, contacts and sensors, by field.
         columns: the map.
-        readers: how the numbers of each entry come from columns, by key.
-        native: arrays that are fields by their own names.
+        readers: readers of the entries, by key.
+        native: arrays with names of the log format.
         frame_column: the column or array with the name of the IMU's frame, "" for none.
     """
 
@@ -426,7 +424,7 @@ class FileFields:
 
     @property
     def given(self) -> tuple[str, ...]:
-        """All fields, of text too."""
+        """All fields, including text."""
         frame = (TEXT_FIELD,) if self.columns.imu_frame is not None or self.frame_column else ()
         return (*self.fields, *self.names, *frame)
 
@@ -438,7 +436,7 @@ class FileFields:
 
     @property
     def step(self) -> float | None:
-        """Between stamps that no column has [s]."""
+        """Constant step between samples [s]; None if a column has the stamps."""
         entry = self.columns.time
         if entry is None or entry.step is None:
             return None
@@ -446,15 +444,15 @@ class FileFields:
         return float(entry.step) * unit_factor(f"{KEY}.time.unit", units.get("", "s"), ("time",))
 
     def stamps(self, start: int, count: int) -> FloatArray:
-        """Stamps [s] of so many samples, of which some are before, by the step between them."""
+        """Stamps [s] of `count` samples from number `start` on, by the constant step."""
         return np.asarray(np.arange(start, start + count) * (self.step or 1.0))
 
     def sources_of(self, name: str) -> tuple[str, ...]:
-        """The columns that a field comes from."""
+        """The columns of a field and of the fields that it is computed from."""
         return (*self._own(name), *(source for other in self._needed(name) for source in self.sources_of(other)))
 
     def constant_sources(self, name: str) -> tuple[str, ...]:
-        """The columns of a field that may hold one number for each joint instead of samples: arrays of gains."""
+        """The columns of a field with possibly one number per joint instead of samples: arrays of gains."""
         matched = (reader.matched for key, reader in self.readers.items() if name in key)
         gains = (x for x in matched if isinstance(x.part.entry, Gains) and not x.by_name)
         return tuple(column for of_gain in gains for column in of_gain.columns)
@@ -484,11 +482,11 @@ class FileFields:
 
     @property
     def _threshold(self) -> float | None:
-        """Above which a contact is active."""
+        """The number above which a contact is active."""
         return None if self.columns.contact_active is None else self.columns.contact_active.above
 
     def other_times(self, given: Collection[str]) -> dict[str, ColumnEntry]:
-        """Entries of stamps beside those of `time`, of those that a file has, by their array."""
+        """Entries of other stamps than `time` that a file has, by their array."""
         if "time" not in self.fields or self.step is not None:
             return {}
         others = {entry.column: entry for entry in self.columns.other_times if entry.column}
@@ -517,7 +515,7 @@ class FileFields:
         return self.text(take) | {name: self.value(name, once) for name in self.fields}
 
     def value(self, name: str, take: Take) -> NDArray[Any]:
-        """A field (N, ...). Raises LogError: columns that do not fit it."""
+        """A field (N, ...). Raises LogError: its columns do not fit the field."""
         if name in self.native:
             return take(name)
         if self.columns.plates and name in (POINTS, WRENCHES[1]):
@@ -544,7 +542,7 @@ class FileFields:
         return np.concatenate([force, moment], axis=2)
 
     def _torque(self, take: Take) -> FloatArray:
-        """What currents or a PD law give, (N, n) [N m or N]."""
+        """Torques (N, n) [N m or N] from motor currents or a PD law."""
         if _CURRENT in self.readers:
             return self.readers[_CURRENT].read(take) * self._torque_per_current()
         terms: list[FloatArray] = []
@@ -568,7 +566,7 @@ class FileFields:
         return factors
 
     def _gains(self, name: str, take: Take | None) -> FloatArray | None:
-        """Stated gains (1, n), or read ones (N, n); None without any, and for read ones that nothing is to be read."""
+        """Stated gains (1, n), or gains from the file (N, n); None without gains, or if `take` is None."""
         gains: Gains | None = getattr(getattr(self.columns.joint_torque, "pd", None), name, None)
         if gains is not None and gains.value:
             key = f"{KEY}.{_PD}.{name}"
@@ -577,7 +575,7 @@ class FileFields:
         return None if gains is None or take is None else self.readers[f"{_PD}.{name}"].read(take)
 
     def _active(self, take: Take) -> NDArray[Any]:
-        """Flags (N, C) of contacts that always touch, or whose force says whether they do."""
+        """Flags (N, C) of contacts that are always active, or from their forces."""
         if self._threshold is None:
             return np.ones((self._length(take), len(self.names["contact_names"])), dtype=np.bool_)
         force = self.value(self._forces[0], take)
@@ -588,7 +586,7 @@ class FileFields:
         return len(take(self.sources_of("time")[0]))
 
     def _plate_poses(self) -> tuple[NDArray[Any], FloatArray]:
-        """Of each contact's force plate, the rotation to the world (C, 3, 3) and the origin (C, 3) [m]."""
+        """Rotation to the world (C, 3, 3) and origin (C, 3) [m] of each contact's force plate."""
         from scipy.spatial.transform import Rotation
 
         contacts = self.names["contact_names"]
@@ -598,7 +596,7 @@ class FileFields:
         return Rotation.from_euler("xyz", rpy, degrees=True).as_matrix(), origin
 
     def _of_plates(self, name: str, take: Take) -> FloatArray:
-        """Wrenches, or points that their moments are about, of plates whose poses the map states, in the world."""
+        """Wrenches of force plates, or the reference points of their moments, in the world."""
         rotation, origin = self._plate_poses()
         if name == POINTS:
             is_read = bool(self._own(name))
@@ -609,16 +607,16 @@ class FileFields:
         return np.asarray(np.einsum("cij,nckj->ncki", rotation, vectors).reshape(wrench.shape))
 
     def check(self) -> FileFields:
-        """The fields themselves; InputError for one computed from others that are not there, or without numbers."""
+        """The fields themselves; InputError if a field needs another that is missing, or a value that is not given."""
         for name in self.columns.fields:
             for other in self._needed(name):
                 if other not in self.fields:
                     gain = {"joint_position": ".pd.kp", "joint_velocity": ".pd.kd"}.get(other, "")
                     gain = gain if name == "joint_torque" else ""
-                    raise LogError.at_field(f"{KEY}.{name}{gain}", f"given without {other}", f"{other} in the log too")
+                    raise LogError.at_field(f"{KEY}.{name}{gain}", f"given without {other}", f"a log with {other}")
         if self._threshold is not None and not self._own("contact_active") and not self._forces:
-            accepted = "a column, or contact forces"
-            raise LogError.at_field(f"{KEY}.contact_active.above", "set, without a force", accepted)
+            accepted = "a column for contact_active, or contact forces in the log"
+            raise LogError.at_field(f"{KEY}.contact_active.above", "nothing to compare with it", accepted)
         for gain in ("kp", "kd"):
             self._gains(gain, None)
         if _CURRENT in self.readers:
@@ -629,18 +627,19 @@ class FileFields:
 
 
 def _above(values: FloatArray, threshold: float | None) -> FloatArray:
-    """1 where a number is above a threshold, 0 where it is not; NaN stays, for whoever checks flags."""
+    """1 where a number is above a threshold, else 0; NaN stays NaN for the check of flags."""
     return values if threshold is None else np.where(np.isnan(values), np.nan, values > threshold)
 
 
 def match_table(columns: Columns | None, header: Sequence[str], in_degrees: bool = False) -> FileFields:
-    """The fields of a table by a map of its columns; `in_degrees`: whether its header says so of all angles.
+    """The fields of a table by a map of its columns; `in_degrees`: its header says that all angles are in degrees.
 
     Raises:
-        InputError: a map that does not fit the columns, or itself.
+        InputError: the map does not fit the columns, or is inconsistent.
     """
     if columns is not None and columns.episodes is not None:
-        raise LogError.at_field(f"{KEY}.episodes", "given for a table", "arrays: stamps of a table begin anew")
+        accepted = "no such key: in a table each episode starts where stamps begin again"
+        raise LogError.at_field(f"{KEY}.episodes", "given for a table", accepted)
     fields = _match(columns, header, {"joint_names": ()}, True)
     for reader in fields.readers.values() if in_degrees else ():
         part = reader.matched.part
@@ -650,8 +649,8 @@ def match_table(columns: Columns | None, header: Sequence[str], in_degrees: bool
         ]
         units = values_by_name(f"{part.where}.unit", part.entry.unit, turning)
         if without := [label for label in turning if label not in units]:
-            reason = f"none of {without[0] or part.key}, in a file with inDegrees=yes"
-            raise LogError.at_field(f"{part.where}.unit", reason, "deg, or deg/s, or rad, or m where nothing turns")
+            reason = f"missing for {without[0] or part.key}, in a file with inDegrees=yes"
+            raise LogError.at_field(f"{part.where}.unit", reason, "deg, deg/s or rad; m for slides")
     return fields
 
 
@@ -661,14 +660,13 @@ def match_arrays(columns: Columns | None, given: Sequence[str], load: Take) -> F
     Args:
         columns: the map; None without one.
         given: names of the arrays.
-        load: reads one; called for those that hold names, or records.
+        load: reads an array; called for arrays of names or records.
 
     Raises:
-        InputError: a map that does not fit the arrays, or itself.
+        InputError: the map does not fit the arrays, or is inconsistent.
     """
     if columns is not None and columns.rows_of is not None:
-        accepted = "a table: rows are those of CSV, Parquet, JSON lines"
-        raise LogError.at_field(f"{KEY}.rows_of", "given for arrays", accepted)
+        raise LogError.at_field(f"{KEY}.rows_of", "given for arrays", "a table (CSV, Parquet, JSON lines)")
     if columns is not None:
         patterns = [text for part in list_parts(columns).values() for text in part.patterns]
         given = with_parts(given, [name for text in patterns for name in _named_fields(text, given, load)])
@@ -682,7 +680,7 @@ def match_arrays(columns: Columns | None, given: Sequence[str], load: Take) -> F
 def _match(
     columns: Columns | None, given: Sequence[str], named: Mapping[str, tuple[str, ...]], is_table: bool
 ) -> FileFields:
-    """The fields of a file with some columns or arrays; `named`: names that it states itself."""
+    """The fields of a file with the columns or arrays `given`; `named`: names that the file states."""
     has_map = columns is not None
     columns = Columns() if columns is None else columns
     check_columns(columns)
@@ -703,7 +701,9 @@ def _match(
     native_columns = {x: native[x] for x in others if x in native and not _is_ignored(columns, x)}
     for text, field in native_columns.items():
         if field in columns.fields or (field == TEXT_FIELD and columns.imu_frame is not None):
-            raise LogError.at_field(f"{KEY}.{field}", f"beside '{text}'", f"one of the two, the other in {KEY}.ignore")
+            raise LogError.at_field(
+                f"{KEY}.{field}", f"given twice, also as '{text}'", f"one of them, the other in {KEY}.ignore"
+            )
     if is_table:
         of_format = {field: native_part(field) for field in COLUMN_FIELDS if field in native_columns.values()}
         of_format.pop(TEXT_FIELD, None)
@@ -720,18 +720,18 @@ def _match(
 
 
 def _is_ignored(columns: Columns, text: str) -> bool:
-    """Whether a column with a name of the log format is to be left out: by a pattern that says more than `*`."""
+    """Whether a pattern other than `*` ignores a column with a name of the log format."""
     return any(letters_of(pattern) and fits(text, pattern) for pattern in columns.ignore)
 
 
 def read_stamps(entry: ColumnEntry, load: Take) -> FloatArray:
-    """Stamps (N,) [s] of an entry of `other_times`; LogError for an array that holds none."""
+    """Stamps (N,) [s] of an entry of `other_times`; LogError for an array without stamps."""
     (part,) = list_parts(Columns(time=TimeEntry(**vars(entry)))).values()
     return EntryReader(Matched(part, (), (entry.column or "",), False, False), ()).read(load)
 
 
 def _named_fields(text: str, given: Collection[str], load: Take) -> list[str]:
-    """The fields of records that a pattern of their names means; a name that is no such pattern itself."""
+    """The fields of records that fit a pattern; the text itself if it is no such pattern."""
     root = text.partition("['")[0]
     if root == text or root not in given or not PLACEHOLDER.search(text):
         return [text]
@@ -745,7 +745,7 @@ def _require_once(matched: Mapping[str, Matched]) -> None:
     for key, match in matched.items():
         for column in match.columns:
             if column in owners:
-                reason = f"column '{excerpt(column)}', which {KEY}.{owners[column]} has already"
+                reason = f"column '{excerpt(column)}' is already in {KEY}.{owners[column]}"
                 raise LogError.at_field(match.part.where, reason, "every column once")
             owners[column] = key
 
@@ -753,7 +753,7 @@ def _require_once(matched: Mapping[str, Matched]) -> None:
 def _common_names(
     columns: Columns, matched: Mapping[str, Matched], named: Mapping[str, tuple[str, ...]]
 ) -> dict[str, tuple[str, ...]]:
-    """Names of joints, contacts and sensors: those that the file states, else of the first entry, of torques last."""
+    """Names of joints, contacts and sensors: stated by the file, else those of the first entry; torques come last."""
     listed = [(match.part.where, match.part.names_field, match.names) for match in matched.values() if match.part.kind]
     if columns.contact_active is not None and columns.contact_active.always:
         listed.append((f"{KEY}.contact_active.always", "contact_names", tuple(columns.contact_active.always)))
@@ -772,7 +772,7 @@ def _common_names(
 
 
 def columns_of_file(columns: Columns, given: Sequence[str]) -> Columns:
-    """The map for a file with some columns or arrays: with one of `other_times` if that of `time` is not there."""
+    """The map for a file: if the column of `time` is missing, an entry of `other_times` replaces it."""
     others = [entry for entry in columns.other_times if entry.column in given]
     if not others or (columns.time is not None and columns.time.column in given):
         return columns

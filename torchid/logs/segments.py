@@ -28,7 +28,7 @@ def long_segments(time: FloatArray, segments: Sequence[slice], whole: Timeline) 
         cutoff_hz = whole.cutoff_hz
         needed = f"more than {2.0 * DROPPED_PERIODS / cutoff_hz:.3g} s" if cutoff_hz else "more samples"
         reason = f"segments of at most {longest:.3g} s without a gap"
-        raise LogError.at_field("time", reason, f"{needed}, of which both ends are dropped, or a higher cutoff_hz")
+        raise LogError.at_field("time", reason, f"{needed} (both ends are dropped), or a higher cutoff_hz")
     return usable
 
 
@@ -71,7 +71,7 @@ def with_delayed(log: Log, delay: float | FloatArray, channels: Mapping[str, sli
     kept = recorded_at_delays(log.time, (delays,))
     if not kept.any():
         longest = delays[np.argmax(np.abs(delays))]
-        reason = f"{log.time[-1] - log.time[0]:.3g} s, no longer than actuators.delay of {longest:g} s"
+        reason = f"{log.time[-1] - log.time[0]:.3g} s, not longer than actuators.delay ({longest:g} s)"
         raise LogError(log.source, "time", reason, "a longer log")
     moved: dict[str, Any] = {name: values.copy() for name, values in log.arrays().items() if name in channels}
     for segment in unbroken_segments(log.time):

@@ -183,22 +183,22 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline,
         return
     if _stands_still(log, noise):
         warn_about_file(
-            "no joint moves by more than the noise of its positions; one posture shows weights, no friction, and "
+            "no joint moves by more than its position noise: the log determines weights, but no friction, and "
             "inertia only if the base moves"
         )
         return
     names = [f"{name} ({100.0 * share:.0f} %)" for name, share, _ in noisy]
-    reason = f"a large part of these accelerations is noise: {join_names(names, _NAMED)}"
+    reason = f"these accelerations are largely noise: {join_names(names, _NAMED)}"
     cutoff = timeline.cutoff_hz
     if cutoff is None:
-        advice = "a low-pass filter, preprocessing.cutoff_hz"
+        advice = "set preprocessing.cutoff_hz (a low-pass filter)"
     else:
         shares = np.array([share for _, share, _ in noisy])
         powers = np.array([2 * order + 1 for *_, order in noisy])  # of the cutoff, with which the noise goes
         ratios = _LITTLE / (1.0 - _LITTLE) * np.maximum(1.0 - shares, 1e-3) / shares
         lower = cutoff * float(np.median(ratios ** (1.0 / powers)))  # as channels may hardly move
-        advice = f"a cutoff of {lower:.2g} Hz, if the motion is that slow, or faster motion"
-    warn_about_file(f"{reason}; what rests on them is uncertain; accepted: {advice}")
+        advice = f"set cutoff_hz: {lower:.2g} if the motion is that slow, or record faster motion"
+    warn_about_file(f"{reason}. Inertias are uncertain; {advice}")
 
 
 def _stands_still(log: Log, noise: SignalNoise) -> bool:

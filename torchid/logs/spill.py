@@ -64,7 +64,7 @@ class Spill:
         return np.memmap(self._file, dtype, "r+", shape=shape, order=order)
 
     def _failure(self, error: OSError) -> SpillError:
-        accepted = "a folder with room for the log, or a preprocessing.memory_gb that takes it"
+        accepted = "a folder with space for the log, or a larger preprocessing.memory_gb"
         return SpillError(self.source, f"temporary file in {self.folder}", f"cannot be written ({error})", accepted)
 
 

@@ -32,7 +32,7 @@ _PARQUET = {  # limits on metadata: bytes of names and statistics, entries of li
 }
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _EMPTY = ["", " ", "  ", "nan", "NaN", "NAN"]
-_NUMBERS = "numbers, or empty cells where nothing was measured"
+_NUMBERS = "numbers, or empty cells for missing values"
 _BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
 _SHORT_ROW = re.compile(r".*?Row #(\d+): Expected (\d+) columns, got (\d+)", re.DOTALL)
 _SEPARATORS = (",", ";", "\t")
@@ -133,7 +133,7 @@ def _decoded(path: Path, lines: Sequence[bytes]) -> tuple[str, list[str]]:
     """The encoding, UTF-8 or else Latin-1, as of degree signs in old spreadsheets; and the lines."""
     whole = b"".join(lines)
     if b"\0" in whole:
-        raise LogError(path, "header", "bytes that are no letters", "text in UTF-8 or Latin-1")
+        raise LogError(path, "header", "bytes that are not text", "text in UTF-8 or Latin-1")
     if not whole.strip():
         raise LogError(path, "header", "an empty line", "the names of the columns")
     try:
@@ -155,7 +155,7 @@ def _line_of_names(path: Path, texts: Sequence[str], first: int) -> int | None:
     named = next((k for k in alike if k in plain), (alike or plain)[-1] if alike or plain else None)
     if between := [k for k in plain if named is not None and k > named and not _count_numbers(texts[k])]:
         reason = f"'{excerpt(texts[between[0]])}' between the names and the first row"
-        accepted = "rows of numbers below the names; units go to logs.columns, and names in several lines into one"
+        accepted = "rows of numbers directly below one line of names; put units into logs.columns"
         raise LogError(path, f"line {between[0] + 1}", reason, accepted)
     return named
 
@@ -205,9 +205,7 @@ def _opensim_lines(path: Path, stream: Any) -> tuple[int, bool]:
             return number, in_degrees
         if not line:
             break
-    raise LogError(
-        path, "header", "no line endheader", "OpenSim's lines up to endheader, then the names of the columns"
-    )
+    raise LogError(path, "header", "no line endheader", "a header of OpenSim: lines up to endheader, then column names")
 
 
 def check_column_names(names: Sequence[str]) -> None:
@@ -218,7 +216,7 @@ def check_column_names(names: Sequence[str]) -> None:
     for name in names:
         if len(name) > _MAX_COLUMN_LETTERS or not is_plain(name):
             reason = f"a name of {len(name)} characters: {excerpt(name)}"
-            raise LogError.at_field("header", reason, f"names of one line and at most {_MAX_COLUMN_LETTERS} characters")
+            raise LogError.at_field("header", reason, f"one line of at most {_MAX_COLUMN_LETTERS} characters")
         if name in seen:
             raise LogError.at_field(f"column '{name}'", "given twice", "every column once")
         seen.add(name)
@@ -361,7 +359,7 @@ class _Served:
     def _bad_cell(self, header: TextHeader, names: Sequence[str], error: Exception) -> LogError | None:
         """The error of a cell that is no number, or of a row with too many cells or too few; None for any other."""
         if row := _SHORT_ROW.match(str(error)):
-            return LogError(self._path, f"row {row[1]}", f"{row[3]} cells", f"{row[2]} cells, as there are names")
+            return LogError(self._path, f"row {row[1]}", f"{row[3]} cells", f"{row[2]} cells, as in the line of names")
         bad = _BAD_CELL.match(str(error))
         if bad is None:
             return None
@@ -417,7 +415,7 @@ class _Served:
             if not self._origin.get(f"{name}[0]"):
                 return None  # lists of several lengths, which nobody may need
             reason = f"lists of {expected} and of {lengths[lengths != expected][0]} numbers"
-            raise LogError.at_field(f"column '{name}'", reason, "lists of one length")
+            raise LogError.at_field(f"column '{name}'", reason, "lists of equal length")
         if not 0 < expected <= MAX_LIST:
             return None
         flat = lists.drop_null().flatten().to_numpy(zero_copy_only=False)

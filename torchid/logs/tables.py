@@ -90,7 +90,7 @@ def common_texts(blocks: Iterable[Arrays]) -> Arrays:
         for name, array in block.items():
             if field_shape(name)[:1] != ("N",) and array.tolist() != out.setdefault(name, array).tolist():
                 reason = f"'{out[name]}' and '{array}'"
-                raise LogError.at_field(f"column '{name}'", reason, "one name, the same in every row")
+                raise LogError.at_field(f"column '{name}'", reason, "the same name in every row")
     return out
 
 
@@ -139,7 +139,7 @@ def _fields(fields: FileFields, columns: Arrays) -> Arrays:
         words = sorted(np.unique(columns[fields.frame_column]).tolist(), key=lambda word: not word)
         if len(words) > 1 or words == [""]:
             reason = " and ".join(f"'{excerpt(str(word))}'" if word else "an empty cell" for word in words[:2])
-            raise LogError.at_field(f"column '{TEXT_FIELD}'", reason, "one name, the same in every row")
+            raise LogError.at_field(f"column '{TEXT_FIELD}'", reason, "the same name in every row")
         columns[fields.frame_column] = np.array(str(words[0]).strip() if words else "")
     out = fields.read(columns.pop)
     if not out["joint_names"].size:  # a robot without joints
@@ -163,7 +163,7 @@ def _without_repeats(blocks: Iterable[Arrays]) -> Iterator[Arrays]:
         count += len(again)
         yield block | {name: np.delete(x, again, axis=0) for name, x in fields.items()} if len(again) else block
     if count:
-        warn_about_file(f"{format_count(count, 'row')} like the one before, stamp and all: counted once")
+        warn_about_file(f"{format_count(count, 'row')} equal to the previous one, including the stamp: ignored")
 
 
 # ------------------------------------------------------------------------------------------------ a row for each joint
@@ -188,8 +188,8 @@ def row_names_in_map(columns: Columns, texts: Sequence[str]) -> RowNames:
     named = ["time"] if entry is None else [entry.column, *(getattr(entry, fraction) for fraction in FRACTIONS)]
     stamps = [text for text in named if text in texts]
     if not stamps:
-        accepted = f"a column of stamps in {KEY}.time, by which rows belong together"
-        raise LogError.at_field(_ROWS_OF, f"no column of stamps beside '{name}'", accepted)
+        accepted = f"a column of stamps in {KEY}.time, to group the rows"
+        raise LogError.at_field(_ROWS_OF, "no column of stamps", accepted)
     return RowNames(name, stamps)
 
 
@@ -221,7 +221,7 @@ def pivoted(columns: Mapping[str, NDArray[Any]], rows: RowNames) -> Arrays:
     samples = samples.reshape(-1)
     others = {name: x for name, x in columns.items() if name not in (rows.column, *rows.stamps) and _has_flags(x)}
     if len(others) * len(words) > MAX_COLUMNS:
-        reason = f"{len(words)} names in {format_count(len(others), 'column')} of numbers"
+        reason = f"{len(words)} names and {format_count(len(others), 'column')} of numbers"
         raise LogError.at_field(f"column '{rows.column}'", reason, f"at most {MAX_COLUMNS} columns in all")
     out = dict(zip(rows.stamps, keys.T, strict=True))
     again = len(samples) - len(np.unique(samples * len(words) + codes))
@@ -237,11 +237,11 @@ def pivoted(columns: Mapping[str, NDArray[Any]], rows: RowNames) -> Arrays:
         other = ~((wide[samples, codes] == values) | np.isnan(values))
         if again and other.any():
             row = int(np.argmax(other))
-            reason = f"two rows of '{excerpt(words[codes[row]])}' at {keys[samples[row]][0]:.10g}, with two of '{name}'"
-            raise LogError.at_field(f"column '{rows.column}'", reason, "one row of each at each stamp")
+            reason = f"two rows of '{excerpt(words[codes[row]])}' at {keys[samples[row]][0]:.10g} differ in '{name}'"
+            raise LogError.at_field(f"column '{rows.column}'", reason, "one row per name and stamp")
         out |= {f"{name}.{word}": x for word, x in zip(words, np.ascontiguousarray(wide.T), strict=True)}
     if again:
-        warn_about_file(f"{format_count(again, 'row')} of a joint and stamp that have one already: counted once")
+        warn_about_file(f"{format_count(again, 'row')} with the same joint and stamp as another: ignored")
     return out
 
 
@@ -285,11 +285,11 @@ def _columns_of(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
         ]
         for j, text in enumerate(texts):
             if text != text.strip():
-                raise LogError.at_field(f"column '{text}'", "a space at its end", "names without")
+                raise LogError.at_field(f"column '{text}'", "a space at its end", "names without such spaces")
             columns[text] = flat[:, j]
     check_column_names(list(columns))
     stated = match_table(None, list(columns)).names
     for name in NAME_FIELDS:
         if name in arrays and len(arrays[name]) and stated.get(name) != tuple(arrays[name].tolist()):
-            raise LogError.at_field(name, "names without any values", "a .npz or .h5 file, or a field of them")
+            raise LogError.at_field(name, "names without values", "a .npz or .h5 file, or a field with these names")
     return columns

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from torchid.errors import LogError, excerpt
+from torchid.errors import LogError, excerpt, format_count
 from torchid.logs.log import FloatArray, check_time
 
 RANGE_ACCEPTED = (
-    "[START:END], each empty, seconds from the log's first stamp (below 0: before its end) or a share of it (80%); [#2]"
-    " for the third of recordings one after the other"
+    "[START:END] in seconds from the first stamp (negative: before the end) or in percent (80%), each may be empty;"
+    " [#2] for the third recording of a file"
 )
 """Accepted after the name of a log, in messages."""
 
@@ -87,9 +87,9 @@ class TimeRange:
         first, last = (int(np.searchsorted(since, bound - slack)) for bound in (start, stop))
         inside = -slack <= start and stop <= length + slack
         if not inside or first >= last:
-            reason = f"{self.text} of a log that lasts {length:.6g} s ({len(time)} samples)"
-            reason += ", without a sample in it" if inside else ""
-            raise LogError.at_field("time range", reason, f"a part of 0 to {length:.6g} s that has samples")
+            reason = f"{self.text}, but the log lasts {length:.6g} s ({len(time)} samples)"
+            reason += "; this range has no sample" if inside else ""
+            raise LogError.at_field("time range", reason, f"a range within 0 to {length:.6g} s with samples")
         return slice(first, last)
 
 
@@ -134,7 +134,7 @@ class Recording:
         """
         starts = recording_starts(time)
         if self.number >= len(starts):
-            reason = f"{self.text} of a file in which stamps begin {len(starts)} times"
+            reason = f"{self.text}, but the file has {format_count(len(starts), 'recording')}"
             raise LogError.at_field("recording", reason, f"[#0] to [#{len(starts) - 1}]")
         return slice(*[*starts, len(time)][self.number : self.number + 2])
 
@@ -169,7 +169,7 @@ JOINED = " + "
 
 #: Seconds behind the name of one of several files: `plates.csv@-0.12s`.
 _SHIFT = re.compile(r"(.+)@([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)s?")
-JOINED_ACCEPTED = "FILE + FILE, each with @SECONDS where its clock is to be shifted: 'motion.csv + plates.csv@0.12s'"
+JOINED_ACCEPTED = "FILE + FILE, with @SECONDS to shift the clock of a file: 'motion.csv + plates.csv@0.12s'"
 """Accepted as a name of several files, in messages."""
 
 
@@ -269,5 +269,5 @@ def split_range(path: str | os.PathLike[str]) -> LogPart:
     try:
         return LogPart(path.with_name(file), TimeRange.parse(bracket + inside))
     except ValueError as error:
-        text = f"'{excerpt(bracket + inside)}' behind its name, and no file of that name"
+        text = f"'{excerpt(bracket + inside)}' is no range, and no such file exists"
         raise LogError(path, "time range", text, RANGE_ACCEPTED) from error

@@ -243,7 +243,7 @@ def lay_out_timeline(
     dropped = DROPPED_SAMPLES if differentiates else 0
     kept = slice(dropped, len(native) - dropped)
     if cutoff_hz is not None:
-        unit = f" (steps of {step:.6g} s: are the stamps in s?)" if step > LONGEST_MEDIAN_STEP else ""
+        unit = f" (steps of {step:.6g} s: are stamps in seconds?)" if step > LONGEST_MEDIAN_STEP else ""
         _check_rate("cutoff_hz", cutoff_hz, 0.5 / step, f"half the log's median sample rate{unit}")
         if np.max(np.abs(np.diff(native) - step)) > JITTER * step:
             grid = step * np.arange(math.floor(native[-1] / step + JITTER) + 1)
@@ -269,11 +269,11 @@ def _resampled(
     accepted = f"{FASTEST:g} times the log's median sample rate"
     _check_rate("sample_rate_hz", sample_rate_hz, FASTEST / step, accepted)
     if cutoff_hz is not None and cutoff_hz >= 0.5 * sample_rate_hz:
-        accepted = f"a rate above {2.0 * cutoff_hz:g} Hz, twice the cutoff, so that nothing aliases"
+        accepted = f"a rate above {2.0 * cutoff_hz:g} Hz (twice the cutoff) to avoid aliasing"
         raise InputError.at_field("preprocessing.sample_rate_hz", f"{sample_rate_hz:g}", accepted)
     output = _uniform(grid[kept], sample_rate_hz)
     if len(output) < 2:
-        reason = f"{sample_rate_hz:g}, which leaves one sample"
+        reason = f"{sample_rate_hz:g} leaves one sample"
         accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
         raise InputError.at_field("preprocessing.sample_rate_hz", reason, accepted)
     if (each := _share_kept(grid, 1.0 / sample_rate_hz)) is not None:  # no spline has to find what is there
@@ -292,8 +292,8 @@ def _median_step(native: FloatArray) -> float:
         accepted = f"steps of at most {LONGEST_STEP:g} times the median of {step:.6g} s; split the log there"
         raise LogError.at_field("time", reason, accepted)
     if steps[shortest] < SHORTEST_STEP * step:
-        what = f"a step of {steps[shortest]:.6g} s after sample {shortest}, the median being {step:.6g} s"
-        warn_about_file(f"time: {what}: interpolation multiplies the noise there")
+        what = f"a step of {steps[shortest]:.6g} s after sample {shortest} (median {step:.6g} s)"
+        warn_about_file(f"time: {what}: interpolation amplifies noise there")
     return step
 
 
@@ -311,7 +311,7 @@ def _unspoiled(grid: FloatArray, step: float, cutoff_hz: float, padding: int) ->
     inside = np.flatnonzero((grid >= margin) & (grid <= grid[-1] - margin))
     if not len(inside) or len(grid) <= padding:
         shortest = max(2.0 * margin, padding * step)
-        accepted = f"more than {shortest:.6g} s for a cutoff of {cutoff_hz:g} Hz, which spoils both ends of a log"
+        accepted = f"more than {shortest:.6g} s: the {cutoff_hz:g} Hz filter loses both ends of a log"
         raise LogError.at_field("time", f"{grid[-1]:.6g} s ({len(grid)} samples)", accepted)
     return slice(int(inside[0]), int(inside[-1]) + 1)
 

@@ -112,9 +112,9 @@ def require_joints_of(field: str, robot: str, joints: Collection[str]) -> None:
     """
     absent = [name for name in JOINT_ORDERS[robot].names if name not in joints]
     if absent:
-        reason = f"'{robot}', whose joint '{absent[0]}' the robot has not"
+        reason = f"'{robot}' has a joint '{absent[0]}', your robot has not"
         accepted = ", ".join(suitable_orders(joints))
-        accepted = accepted or "names of joints by number, as no robot known by name has these"
+        accepted = accepted or "joint names by number: no known robot has these joints"
         raise ConfigError.at_field(field, reason, accepted)
 
 

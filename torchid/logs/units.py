@@ -97,7 +97,7 @@ def unit_factor(key: str, unit: str, quantities: tuple[str, ...]) -> float:
     others = [quantity for quantity, units in UNITS.items() if plain in units]
     reason = f"'{excerpt(unit)}', " + (f"a unit of {others[0]}" if others else "an unknown unit")
     accepted = ", ".join(text for quantity in quantities for text in UNITS[quantity])
-    raise ConfigError.at_field(key, reason, accepted or "no unit, as this is a number without one")
+    raise ConfigError.at_field(key, reason, accepted or "no unit: this number has none")
 
 
 def quantities_with(unit: str) -> tuple[str, ...]:
