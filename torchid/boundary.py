@@ -124,10 +124,8 @@ def _describe_failure(error: Exception) -> tuple[int, str]:
     if isinstance(error, OSError) and error.errno in _MACHINE:
         return 1, f"{where}{type(error).__name__}: {error}"
     text = str(error) or "no text"
-    return (
-        1,
-        f"{where}{type(error).__name__}: {text}; this is a fault in torchid, please report it (--debug shows where)",
-    )
+    report = "this is a bug in torchid: please report it with the output of --debug"
+    return 1, f"{where}{type(error).__name__}: {text}; {report}"
 
 
 class _Warnings:
@@ -152,14 +150,14 @@ class _Warnings:
         else:
             if not (self._debug or issubclass(category, _NUMERICAL)) or kind in self._printed:
                 return
-            text = f"NumericalWarning: a library met a number that it cannot handle ({message})"
+            text = f"NumericalWarning: a library could not handle a number ({message})"
         self._printed.add(kind)
         _print_line(self._program, text)
 
     def count_folded(self) -> None:
         """Print how many warnings have not been printed, if any."""
         if self._folded:
-            _print_line(self._program, f"and {format_count(self._folded, 'warning')} like these: --verbose")
+            _print_line(self._program, f"and {format_count(self._folded, 'warning')} like these; --verbose shows them")
 
 
 def _without_names(text: str) -> str:

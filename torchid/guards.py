@@ -118,7 +118,7 @@ def check_unpacked_size(path: Path, total: int, copy: Path | None = None) -> Non
     """Raise LogError where a file, or its copy, declares arrays of `total` bytes, far more than its size allows."""
     size = (copy or path).stat().st_size
     if total > max_unpacked_bytes(size):
-        reason = f"arrays of {total} bytes in a file of {size}"
+        reason = f"arrays of {total} bytes in a file of {size} bytes"
         accepted = f"at most {max_unpacked_bytes(size)} bytes in a file of this size"
         raise LogError(path, "file", reason, accepted)
 
@@ -126,18 +126,18 @@ def check_unpacked_size(path: Path, total: int, copy: Path | None = None) -> Non
 def check_fields(names: Iterable[str | bytes], count: int) -> None:
     """Raise ValueError at more arrays than a log may have, or at an unprintable or too long name."""
     if count > MAX_FIELDS:
-        raise ValueError(f"{count} arrays, more than the {MAX_FIELDS} that a log may have")
+        raise ValueError(f"{count} arrays; a log may have {MAX_FIELDS}")
     for name in names:
         if isinstance(name, bytes) or len(name) > MAX_LETTERS or not name.isprintable():
-            raise ValueError(f"a name of {len(name)} characters that is none of a log's: {ascii(name[:40])}")
+            raise ValueError(f"a name that no log has ({len(name)} characters): {ascii(name[:40])}")
 
 
 def check_names(shape: Sequence[int], longest: int = 0) -> None:
     """Raise ValueError where an array of text of this shape has too many or too long names."""
     if math.prod(shape) > MAX_NAMES:
-        raise ValueError(f"{math.prod(shape)} texts, where at most {MAX_NAMES} are names, and none are numbers")
+        raise ValueError(f"{math.prod(shape)} texts; at most {MAX_NAMES} names may be text")
     if longest > MAX_LETTERS:
-        raise ValueError(f"a name of {longest} characters, more than {MAX_LETTERS}")
+        raise ValueError(f"a name of {longest} characters; at most {MAX_LETTERS} are allowed")
 
 
 def require_plain_name(text: str) -> str:

@@ -88,7 +88,7 @@ def open_apart(opener: Opener, path: Path) -> Iterator[RemoteObject]:
     try:
         reader = _take()
     except OSError as error:
-        raise LogError(path, "file", f"Python does not start to read it ({error})", "one that may be run") from error
+        raise LogError(path, "file", f"cannot start Python to read it ({error})", "an executable Python") from error
     try:
         reader.open(opener, path)
         yield RemoteObject(reader)
@@ -219,7 +219,7 @@ class _Reader:
         patience = _ANSWER_SECONDS * self._limits[1] or None
         if sys.platform != "win32" and not select.select([self._answers], [], [], patience)[0]:
             self.end()
-            raise self._failure(f"no answer of its reader for {patience:g} s")
+            raise self._failure(f"its reader did not answer for {patience:g} s")
         try:
             return _receive(self._answers)
         except EOFError as error:
@@ -229,7 +229,7 @@ class _Reader:
     def _why_ended(self) -> str:
         code = self._process.returncode
         if code == -getattr(signal, "SIGXCPU", 0):
-            return f"reading it takes more than {self._limits[1]} s of processor time"
+            return f"reading it takes more than {self._limits[1]} s of CPU time"
         reason = signal.Signals(-code).name if code < 0 else f"status {code}"
         return f"its reader crashed ({reason})"
 
@@ -249,7 +249,7 @@ def _factor() -> float:
 
 
 def _accepted() -> str:
-    return f"a file that is read within the limits, or {LIMITS}=4 in the environment for four times as much"
+    return f"a smaller file, or {LIMITS}=4 in the environment for four times higher limits"
 
 
 def _error(module: str, name: str, text: str, args: list[Any]) -> Exception:
@@ -259,7 +259,7 @@ def _error(module: str, name: str, text: str, args: list[Any]) -> Exception:
         if issubclass(known, InputError):
             return known(*args)
     if name.endswith("MemoryError"):
-        return LogError.at_field("file", "reading it needs more memory than it may take", _accepted())
+        return LogError.at_field("file", "reading it exceeds the memory limit", _accepted())
     return type(name, (Exception,), {})(text)
 
 

@@ -121,7 +121,7 @@ def test_libraries_do_not_speak_to_users(capsys: pytest.CaptureFixture[str]) -> 
     assert run_guarded("torchid", command) == 0
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert said.startswith("torchid: NumericalWarning: a library met a number that it cannot handle (overflow")
+    assert said.startswith("torchid: NumericalWarning: a library could not handle a number (overflow")
 
 
 def test_a_reader_who_has_enough_is_not_told(
@@ -212,7 +212,7 @@ def test_a_terminal_gets_the_first_of_alike_warnings_and_their_number_and_a_file
         assert lines == [f"torchid: TorchidWarning: {text}" for text in told]
     lines = _warn_of_logs(told, monkeypatch, terminal=True, fold=True)
     first = [f"torchid: TorchidWarning: {text}" for text in (told[0], told[-3], told[-2])]
-    assert lines == [*first, "torchid: and 9 warnings like these: --verbose"]
+    assert lines == [*first, "torchid: and 9 warnings like these; --verbose shows them"]
     assert _warn_of_logs(told[-3:-1], monkeypatch, terminal=True, fold=True) == first[1:]
 
 

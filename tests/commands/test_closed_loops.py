@@ -101,7 +101,7 @@ def test_a_urdf_with_stated_loops_is_the_same_robot(tmp_path: Path) -> None:
     [
         ([{"frames": ["knee"]}], "two frames of the robot"),
         ([{"frames": ["shank", "pelvis"]}], "robot.loops[0].frames: unknown name 'pelvis'"),
-        ([{"frames": ["shank", "toe"]}], "robot.loops[0].frames: shank and toe, frames of one body"),
+        ([{"frames": ["shank", "toe"]}], "robot.loops[0].frames: shank and toe are on the same body"),
         ([{"frames": ["shank", "crank"], "type": "hinge"}], "robot.loops.0.type: found 'hinge'; accepted: 'point'"),
         ("knee", "a list of mappings: [{frames: [l_rod_end"),
     ],

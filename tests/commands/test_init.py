@@ -56,7 +56,7 @@ def test_a_robot_without_masses_and_its_weight_are_enough_to_identify_it(
     )
     assert main([*line, "--total-mass", "7"]) == 0
     assert main(["identify", files[2], f"output={tmp_path / 'run'}", "preprocessing.cutoff_hz=5"]) == 0
-    said = "no link has mass; 7 kg are spread evenly over 3 links, as balls of water"
+    said = "no link has mass; 3 links share 7 kg equally, as balls of water"
     assert capsys.readouterr().err.count(said) == 2, "once in each command"
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())["test"]
     assert metrics["joint_torque_rms_relative"] < 0.02

@@ -239,7 +239,7 @@ def test_joints_that_messages_spell_otherwise_are_named_and_those_that_they_lack
         assert set(again.joint_names) == set(spelled.values())
         assert load_config(path.with_suffix(".yaml")).robot.weld == dict.fromkeys(held, 0.0)
         assert any(text.startswith("robot.weld: ") for text in said.assumed)
-        assert "joint_states: one prefix or suffix of the names for another" in said.assumed
+        assert "joint_states: names differ only in a prefix or suffix" in said.assumed
         assert not any("joint_position" in text for text in said.missing)
     other = load_config(path.with_suffix(".yaml"), ["logs.topics.joint_states.names={a: left_kne_joint}"])
     with pytest.raises(
@@ -276,7 +276,7 @@ def test_wrenches_go_to_the_feet_in_their_frames_or_names(tmp_path: Path) -> Non
     }
     weight = 9.81 * float(load_robot(G1).nominal[:, 0].sum())
     assert topics["contact_force_threshold"] == pytest.approx(0.05 * weight, rel=0.05)
-    assert any("frames of messages are others, taken to be those of the contacts" in text for text in said.assumed)
+    assert any("the messages' frames are taken for the contact frames" in text for text in said.assumed)
     wrenches = np.asarray(again.contact_wrench_local)
     np.testing.assert_array_equal(wrenches[0, :, 3], [1, 2])
     np.testing.assert_array_equal(np.asarray(again.contact_active)[:2], [[False, True], [True, True]])
@@ -306,7 +306,7 @@ def test_flags_of_some_feet(tmp_path: Path) -> None:
     flag = ("/contact/FL", FLAG, lambda i, _: {"data": i > 5})
     said, topics, again = started(GO2_URDF, write_bag(tmp_path / "y.mcap", legged(joints, [flag])))
     assert topics["contact_active"] == {"FL_foot": "/contact/FL", "FR_foot": True, "RL_foot": True, "RR_foot": True}
-    assert "contact_active: FR_foot, RL_foot, RR_foot touching throughout, as no topic says otherwise" in said.assumed
+    assert "contact_active: FR_foot, RL_foot, RR_foot always in contact: no topic has flags" in said.assumed
     assert np.asarray(again.contact_active).sum() == 14 + 60
 
 

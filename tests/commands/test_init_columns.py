@@ -108,7 +108,7 @@ def test_wrenches_and_flags_are_those_of_the_feet_that_they_name(tmp_path: Path)
     wrench = value(found.contact_wrench_local)[:, order]
     np.testing.assert_allclose(wrench[..., :3][touching], log.contact_wrench_local[..., :3][touching], atol=1e-9)
     assert map_in(text)["contact_name"] == "{contact}_foot"
-    assert any(line.startswith("contact_wrench_local: taken to act on the robot") for line in said.assumed)
+    assert any(line.startswith("contact_wrench_local: wrenches act on the robot") for line in said.assumed)
 
 
 def test_one_number_of_each_foot_is_no_flag_but_a_comment(tmp_path: Path) -> None:
@@ -146,7 +146,7 @@ def test_a_robot_known_by_name_has_its_makers_order(tmp_path: Path) -> None:
     assert map_in(text)["joint_order"] == "go2"
     assert map_in(text)["time"] == {"column": "tick", "unit": "ms"}
     np.testing.assert_allclose(found.joint_position[:, found.joint_names.index("FL_hip_joint")], np.sin(time + 3))
-    assert any("the order of motors of go2" in line for line in said.assumed)
+    assert any("the motor order of go2" in line for line in said.assumed)
 
 
 def test_a_list_of_names_in_the_file_is_the_order(tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_a_list_of_names_in_the_file_is_the_order(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", **arrays, name=np.array([*ORDER[:5], "r_finger", *ORDER[5:]]))
     found, said, _ = initiated(tmp_path / "x.npz")
     assert_recorded(found, log)
-    assert any(line.startswith("joint_order: as 'name' lists them") for line in said.assumed)
+    assert any(line.startswith("joint_order: the order in 'name'") for line in said.assumed)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5", ".mat"])
@@ -174,7 +174,7 @@ def test_samples_in_columns_are_transposed_by_their_number(tmp_path: Path, suffi
                 file[f"log/{name}"] = x
     found, said, text = initiated(path)
     assert map_in(text)["joint_position"] == f"{'' if suffix == '.npz' else 'log/'}q.T"
-    assert any(f"are the {len(log)} samples: .T transposes them" in line for line in said.assumed)
+    assert any(f"are the {len(log)} samples; .T transposes it" in line for line in said.assumed)
     assert_recorded(found, log)
     np.testing.assert_array_equal(value(found.base_position_world), value(log.base_position_world))
 
@@ -239,7 +239,7 @@ def test_units_in_headers_are_those_of_the_map(tmp_path: Path, time: str, names:
 def test_a_unit_that_nobody_knows_is_to_be_filled_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = save_csv(tmp_path / "x.csv", by_name(recorded(), ("q_{} [gon]", "dq_{}", "tau_{}")))
     said = init(URDF, path, tmp_path / "x.yaml")
-    assert any("unit 'gon' of its columns is none of angle or length" in line for line in said.missing)
+    assert any("unit 'gon' of its columns is no unit of angle or length" in line for line in said.missing)
     message = refusal(["identify", str(tmp_path / "x.yaml")], tmp_path, capsys)
     assert "logs.columns.joint_position.unit: 'FILL_IN', an unknown unit; accepted: rad, mrad, deg, rev" in message
 
@@ -280,7 +280,7 @@ def test_a_joint_with_a_torque_but_without_a_position_is_said(tmp_path: Path) ->
     columns = by_name(log)
     del columns[f"q_{log.joint_names[4]}"]
     found, said, _ = initiated(save_csv(tmp_path / "x.csv", columns))
-    assert f"joint_torque: without {log.joint_names[4]}, of which there is no position" in said.assumed
+    assert f"joint_torque: without {log.joint_names[4]}: no position in the log" in said.assumed
     assert log.joint_names[4] not in found.joint_names
 
 

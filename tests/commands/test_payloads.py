@@ -86,7 +86,7 @@ def test_all_ways_to_read_agree(world: tuple[Path, float], tmp_path: Path) -> No
         ({"link": "trnk"}, "payload.link of {b}: unknown name 'trnk'; accepted: trunk"),
         (
             {"inertia": [1, 0, 0, 0.1, 0, 0.1]},
-            "payload.inertia of {b}: [1.0, 0.0, 0.0, 0.1, 0.0, 0.1], which no body has; accepted",
+            "payload.inertia of {b}: [1.0, 0.0, 0.0, 0.1, 0.0, 0.1] is not physically consistent; accepted",
         ),
         (None, "logs.train.1.payload: found 3; accepted: a mapping with link, mass [kg], center_of_mass"),
     ],

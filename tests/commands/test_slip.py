@@ -64,7 +64,7 @@ def test_feet_that_stand_lose_no_sample(dragged: Path, tmp_path: Path) -> None:
         (("preprocessing.max_slip=0",), "preprocessing.max_slip: found 0; accepted: auto, null, or a number"),
         (
             ("preprocessing.max_slip=1e-9", "preprocessing.memory_gb=0.0001"),
-            "in which no contact slips; accepted: a larger preprocessing.max_slip",
+            "or a contact slips; accepted: a larger preprocessing.max_slip",
         ),
     ],
 )

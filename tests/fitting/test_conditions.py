@@ -165,7 +165,7 @@ def test_symmetry_that_is_none_is_refused_by_its_key(tmp_path: Path, biped: Robo
         "symmetry: no two bodies differ in 'links' and 'rechts'; accepted: parts of names: pelvis"
     )
     message = refusal(tmp_path, biped, symmetry={"left": "l_", "right": "r_", "normal": "x"})
-    assert "l_hip and r_hip are 0.2 m from being mirror images along x in a robot of " in message
+    assert "l_hip and r_hip miss being mirror images along x by 0.2 m, in a robot of " in message
 
 
 def test_centres_of_mass_inside_nothing_are_refused(tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def test_no_mesh_outside_the_package_is_opened(tmp_path: Path, monkeypatch: pyte
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             assert body_extents(load_robot(path)) == {}
-        assert any("a mesh that cannot be read" in str(warning.message) for warning in caught)
+        assert any("unreadable mesh" in str(warning.message) for warning in caught)
         assert opened == []
 
 

@@ -127,8 +127,8 @@ def test_contacts_of_every_kind_stand_beside_each_other(tmp_path: Path) -> None:
         ("Float32MultiArray", {"index": 0, "component": "fz"}, "FL.component: 'fz', but /foot_forces has"),
         ("Float32", {"index": 0}, "logs.topics.contact_force_normal.FL.index: 0, but /foot_forces has std"),
         ("Float32", {"component": "fx"}, "contact_force_normal.FL.component: 'fx', but /foot_forces has"),
-        ("Bool", {}, "logs.topics.contact_force_normal.FL: /foot_forces has messages of std_msgs/msg/Bool; accepted: std_msgs/"
-         "msg/Float32 or std_msgs/msg/Float64 or std_msgs/msg/Float32MultiArray"),
+        ("Bool", {}, "logs.topics.contact_force_normal.FL: /foot_forces has messages of std_msgs/msg/Bool; accepted: "
+         "std_msgs/msg/Float32 or std_msgs/msg/Float64 or std_msgs/msg/Float32MultiArray"),
     ],
 )  # fmt: skip
 def test_what_is_no_force_is_refused_by_name(tmp_path: Path, kind: str, force: dict[str, Any], message: str) -> None:

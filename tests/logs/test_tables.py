@@ -248,7 +248,7 @@ def test_a_long_text_in_every_row_of_a_parquet_file_is_kept_once(tmp_path: Path)
     )  # 20 GB if spelled out
     table = {"time": np.arange(200_000.0), "imu_frame": text}
     table |= {f"imu_{x}.{axis}": np.zeros(200_000) for x in ("specific_force", "angular_velocity") for axis in "xyz"}
-    assert "more memory than it may take" in log_refusal(save(tmp_path / "x.parquet", table))
+    assert "reading it exceeds the memory limit" in log_refusal(save(tmp_path / "x.parquet", table))
 
 
 def test_without_pyarrow_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

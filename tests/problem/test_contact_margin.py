@@ -88,7 +88,7 @@ def test_a_margin_longer_than_the_phases_is_refused_in_one_line(
     samples, _ = read(file, "preprocessing.contact_margin_s=0.25")
     assert len(samples) == 2 * (PHASE - 26), "the outer ends of the first and last phase, that no change is near to"
     line = refusal(["identify", str(file), "preprocessing.contact_margin_s=30"], tmp_path, capsys)
-    assert "contact_active: no sample further than 30 s from a change of contact" in line
+    assert "contact_active: all samples are within 30 s of a change of contact" in line
     assert "preprocessing.contact_margin_s" in line
 
 

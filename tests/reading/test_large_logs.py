@@ -315,7 +315,7 @@ REFUSED: dict[str, tuple[Callable[[], Log], dict[str, Any], str]] = {
     "tilted": (
         lambda: replace(walked(), **NO_BASE, **NO_FLAGS),
         {"detect_contacts": True, "base_motion": "contacts", "normal": (0.1, 0.0, 1.0)},
-        "base_quat_xyzw: unknown, with base_motion: contacts on a tilted floor in a log that is not in memory at once",
+        "base_quat_xyzw: unknown: base_motion: contacts on a tilted floor needs the whole log in memory",
     ),
 }
 

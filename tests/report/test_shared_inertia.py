@@ -55,7 +55,7 @@ def body_parameters(path: Path) -> np.ndarray:
         "no body's inertia",
     ],
 )
-@pytest.mark.filterwarnings("ignore:.*(exceeds the sum of the others|no inertia at the end)")
+@pytest.mark.filterwarnings("ignore:.*(exceeds the sum of the others|at the end of a limb has no inertia)")
 def test_every_link_of_a_file_is_a_body_and_their_sum_is_what_was_identified(
     tmp_path: Path, finger: str, scale: float, more: tuple[str, ...]
 ) -> None:

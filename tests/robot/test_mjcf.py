@@ -159,7 +159,7 @@ REFUSED = {
     ),
     "a ground of gigabytes": (
         BODY.format("", HINGE.format(""), '<asset><hfield name="h" nrow="50000" ncol="50000" size="1 1 1 1"/></asset>'),
-        "robot.xml: MJCF: MuJoCo fails to read it (",
+        "robot.xml: MJCF: MuJoCo cannot read it (",
     ),
     "attached to itself": (
         BODY.format(
@@ -263,7 +263,7 @@ def test_of_the_world_nothing_is_written_nor_said(tmp_path: Path) -> None:
     [('<option gravity="0 0 -1.6"/>', "0 0 -1.6"), ('<option><flag gravity="disable"/></option>', "0 0 0")],
 )
 def test_another_planet_is_warned_of(tmp_path: Path, option: str, gravity: str) -> None:
-    with pytest.warns(TorchidWarning, match=f"gravity {gravity}; the Earth's"):
+    with pytest.warns(TorchidWarning, match=f"gravity {gravity}; torchid uses the Earth's"):
         robot_of(BODY.format("", HINGE.format(""), option), tmp_path, True)
 
 

@@ -45,7 +45,7 @@ def test_what_holds_the_robot_drops_out_as_a_contact_that_is_not_measured(attach
     path = tmp_path / "arm.xml"
     path.write_text(ARM.format(attachment))
     contact = f"contacts: [{{frame: {frame}, type: {kind}}}]"
-    with pytest.warns(TorchidWarning, match=f"{re.escape(where)}: holds the robot to .*{re.escape(contact)}"):
+    with pytest.warns(TorchidWarning, match=f"{re.escape(where)}: attaches the robot to .*{re.escape(contact)}"):
         robot = load_robot(path, fixed_base=True)
     assert not robot.loops
     assert not robot.passive

@@ -91,7 +91,7 @@ def test_a_body_with_a_mesh_that_cannot_be_read_is_left_out_in_one_line(case: tu
         warnings.simplefilter("always")
         assert list(extents(path)) == ["base"]
     (message,) = (str(warning.message) for warning in caught)
-    assert message.startswith(f"{path}: a mesh that cannot be read at arm (package://a/{name}: ")
+    assert message.startswith(f"{path}: unreadable mesh at arm (package://a/{name}: ")
     assert found in message
     assert "\n" not in message
 

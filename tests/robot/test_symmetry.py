@@ -85,7 +85,7 @@ def refusal(robot: Robot, *tokens: str, **options: object) -> str:
 def test_a_pair_that_is_not_mirrored_is_refused_with_the_distance(tmp_path: Path) -> None:
     robot = mirrored_robot(tmp_path, np.random.default_rng(2), lower=np.array([0.0, 0.03, 0.04]))
     message = refusal(robot, "left", "right")
-    assert "left_lower and right_lower are 0.05 m from being mirror images along y in a robot of " in message
+    assert "left_lower and right_lower miss being mirror images along y by 0.05 m, in a robot of " in message
     assert "left_upper and right_upper are " in refusal(robot, "left", "right", normal="z")
     near = mirrored_robot(tmp_path, np.random.default_rng(2), lower=np.array([0.0, 0.0, 1e-4]))
     assert len(mirror_pairs(near, "left", "right")) == 2

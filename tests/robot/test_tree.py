@@ -146,7 +146,7 @@ def test_a_joint_that_mimics_a_fixed_one_is_held_at_its_offset(kind: str, base_l
         joint("weld", "base", "stand", "fixed"),
         joint("held", "stand", "tip", kind, mimic("weld", 2.0, 0.7)),
     )
-    with pytest.warns(TorchidWarning, match="'weld' is fixed, so that it is fixed too"):
+    with pytest.warns(TorchidWarning, match="'weld' is fixed, so this joint is fixed too"):
         robot = load_robot(path, base_link)
     assert (robot.n, robot.body_names) == (0, (base_link,))
     turn = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix()

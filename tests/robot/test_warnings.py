@@ -19,9 +19,9 @@ from torchid.robot import load_robot
     ("element", "expected"),
     [
         (inertial(ixx="0.3"), "largest principal inertia 0.3 exceeds the sum of the others, 0.2"),
-        (inertial(izz="-0.1"), "principal inertias -0.1, 0.1, 0.1 kg m^2 are not all positive"),
-        (inertial(ixy="0.2"), "are not all positive"),
-        (inertial(mass="0"), "mass 0 kg with an inertia that is not 0"),
+        (inertial(izz="-0.1"), "principal inertias (-0.1, 0.1, 0.1 kg m^2) must be positive"),
+        (inertial(ixy="0.2"), "must be positive"),
+        (inertial(mass="0"), "the mass is 0, but the inertia is not"),
     ],
     ids=["triangle", "negative", "indefinite", "mass 0"],
 )
@@ -46,7 +46,7 @@ def test_a_limb_that_ends_in_a_massless_body_is_warned_of(element: str, tmp_path
     path = write(tmp_path, BASE, link("arm", element), HINGE)
     robot, caught = warned(path)
     assert [w.category for w in caught] == [MasslessBodyWarning]
-    assert str(caught[0].message).startswith(f"{path}: link 'arm': no inertia at the end of a limb")
+    assert str(caught[0].message).startswith(f"{path}: link 'arm' at the end of a limb has no inertia")
     assert robot.massless == ("arm",)
 
 
@@ -103,5 +103,5 @@ def test_inertias_of_no_body_are_said_in_one_line(tmp_path: Path) -> None:
     parts = [link("arm", inertial(ixx="0.3")), HINGE, link("tip", inertial(mass="0")), joint("wrist", "arm", "tip")]
     _, caught = warned(write(tmp_path, BASE, *parts))
     (message,) = [str(w.message) for w in caught]
-    assert "link 'arm': largest principal inertia 0.3 exceeds" in message
-    assert message.endswith("and the inertia of tip is no body's either; used as written")
+    assert "link 'arm': the largest principal inertia (0.3 kg m^2) exceeds" in message
+    assert message.endswith("; also physically inconsistent: tip; it is used as it is")

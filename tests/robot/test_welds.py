@@ -79,9 +79,9 @@ def test_identified_urdf_has_its_joints_and_gives_the_same_bodies_where_they_are
     [
         ({"rol": 0.0}, "unknown name 'rol'"),
         ({"*finger*": 0.0}, "matches no joint that moves"),
-        ({"roll": 2.1}, "2.1, outside of the limits of joint 'roll'; accepted: a position from -1 to 2"),
-        ({"roll": 0.1, "r*": 0.2}, "one position for a joint"),
-        ({"*": 0.0}, "every joint that moves"),
+        ({"roll": 2.1}, "2.1 is outside the limits of joint 'roll'; accepted: a position from -1 to 2"),
+        ({"roll": 0.1, "r*": 0.2}, "one position per joint"),
+        ({"*": 0.0}, "fixes every joint"),
     ],
 )
 def test_welds_that_do_not_fit_the_robot_are_refused(tmp_path: Path, weld: dict[str, float], message: str) -> None:

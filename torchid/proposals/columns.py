@@ -264,7 +264,7 @@ class _Proposer:
         if len(best) == 1:
             return best[0]
         for family in best:
-            self.out.perhaps.append((what, family.entry, "of several that may be it"))
+            self.out.perhaps.append((what, family.entry, "one of several candidates"))
         return None
 
     # ---------------------------------------------------------------------------------------------------------- joints
@@ -299,11 +299,11 @@ class _Proposer:
             return family
         lacks = [x for x in self.robot.joints if x in named and x not in family.names]
         if lacks and name != "joint_torque":
-            self.out.listed.append(f"{name}: no entry, as {lacks[0]} has no column; it follows from the positions")
+            self.out.listed.append(f"{name}: no entry: {lacks[0]} has no column. torchid derives it from the positions")
             return None
         if not (more := [x for x in family.names if x not in named]):
             return family
-        self.out.assumed[name] = f"without {', '.join(more)}, of which there is no position"
+        self.out.assumed[name] = f"without {', '.join(more)}: no position in the log"
         kept = [x in named for x in family.names]
         names, columns, units = (tuple(compress(x, kept)) for x in (family.names, family.columns, family.units))
         by_name = dict(zip(names, columns, strict=True))
@@ -321,7 +321,7 @@ class _Proposer:
             if values is not None and values.dtype.kind in "SU" and values.shape == (count,):
                 matched = exchange_affixes(stated_names(self.sample, name), names)
                 if len(matched) == len(names) > 0:
-                    return [matched.get(x) for x in stated_names(self.sample, name)], f"as '{excerpt(name)}' lists them"
+                    return [matched.get(x) for x in stated_names(self.sample, name)], f"the order in '{excerpt(name)}'"
         return usual_order(kind, self.robot, count)
 
     def _add_order(self, kind: str, family: Family) -> None:
@@ -356,7 +356,7 @@ class _Proposer:
                 self._add_unit(_OF_JOINTS[family.quantity], family, entries[key])
         self.used += law.values()
         self.out.columns["joint_torque"] = {"pd": entries}
-        self.out.assumed["joint_torque"] = "of the PD law of the gains, as no torque was recorded"
+        self.out.assumed["joint_torque"] = "computed from the PD law: the log has no torque"
 
     def _is_of_law(self, family: Family, is_gain: bool) -> bool:
         count = len(self.stated) or len(self.robot.joints)
@@ -382,7 +382,7 @@ class _Proposer:
             if is_free and (best := self._best(name, families)):
                 self._add(name, best, best.entry)
                 if name.startswith("base_quat") and "imu" in best.words:
-                    self.out.assumed[name] = "of the IMU, taken to be that of the base link"
+                    self.out.assumed[name] = "the IMU's orientation is taken for the base link's"
         if all(map(self._known, imu)) and not self._known("imu_frame"):
             self.out.columns["imu_frame"], self.out.assumed["imu_frame"] = self.robot.imu_frame()
 
@@ -400,7 +400,7 @@ class _Proposer:
             if axes == "wxyz":
                 return "base_quat_wxyz"
             for key in () if self._is_turned else ("base_quat_wxyz", "base_quat_xyzw"):
-                self.out.perhaps.append((key, family.entry, f"by the order of its components, {key[-4:]}"))
+                self.out.perhaps.append((key, family.entry, f"if its components are in the order {key[-4:]}"))
         if family.count != 3 or not (axes == "xyz" or (not axes and family.shape in ((), (3,)))):
             return ""
         if family.quantity == "position" and set(of_base) & set(family.words):
@@ -434,7 +434,7 @@ class _Proposer:
         self._place_flags(feet)
         if wrench in self.out.columns and not self._known("contact_active"):
             self.out.columns["contact_active"] = {"above": float(f"{TOUCH_WEIGHT * self.robot.weight:.2g}")}
-            self.out.assumed["contact_active"] = f"above {TOUCH_WEIGHT:.0%} of the robot's weight [N], by the wrenches"
+            self.out.assumed["contact_active"] = f"{TOUCH_WEIGHT:.0%} of the robot's weight [N], from the wrenches"
         self._add_spelling("contact")
 
     def _add_wrench(self, part: str, family: Family) -> None:
@@ -448,7 +448,7 @@ class _Proposer:
             self._add_unit("", family, entry, ("force",) if part == "force" else ("torque",))
         self.out.columns[name] = known | {part: entry} if part else entry
         where = "along the axes of the world" if name == WRENCHES[1] else "along the axes of the contact frames"
-        self.out.assumed[name] = f"taken to act on the robot, {where}"
+        self.out.assumed[name] = f"wrenches act on the robot, {where}"
         self.used.append(family)
         self._add_order("contact", family)
 
@@ -466,7 +466,7 @@ class _Proposer:
                     self._add_order("contact", family)
                 return
             self.out.perhaps.append(
-                ("contact_active", family.entry | {"above": FILL_IN}, "a reading above which it touches")
+                ("contact_active", family.entry | {"above": FILL_IN}, "above: the reading at which it touches")
             )
 
     # ----------------------------------------------------------------------------------------------------------- stamps
@@ -525,7 +525,7 @@ class _Proposer:
         fitting = [x for x in ("s", "ms", "us", "ns") if _STEPS_S[0] <= step * UNITS["time"][x] <= _STEPS_S[1]]
         if fitting and fitting[0] != "s":
             entry["unit"] = fitting[0]
-            self.out.assumed[key] = f"{fitting[0]}, from steps of {step:.3g}"
+            self.out.assumed[key] = f"{fitting[0]}: steps are {step:.3g}"
 
     def _place_step(self) -> None:
         """Stamps by the step that the file states, or by which velocities are the slopes of positions."""
@@ -535,7 +535,7 @@ class _Proposer:
                 step = float(np.ravel(values)[0])
                 if _STEPS_S[0] <= step <= _STEPS_S[1] and (np.ravel(values) == step).all():
                     self.out.columns["time"] = {"step": step}
-                    self.out.assumed["time"] = f"steps of '{name}' [s], as nothing has stamps"
+                    self.out.assumed["time"] = f"the log has no stamps; the step is '{name}' [s]"
                     return
         position, velocity = (self._values(x) for x in ("joint_position", "joint_velocity"))
         if position is None or velocity is None or position.shape != velocity.shape:
@@ -543,7 +543,7 @@ class _Proposer:
         correlation, step = slope_fit(position, velocity)
         if correlation > _MIN_CORRELATION and _STEPS_S[0] <= step <= _STEPS_S[1]:
             self.out.columns["time"] = {"step": float(f"{1e3 * step:.2g}"), "unit": "ms"}
-            self.out.assumed["time"] = "by the slopes of positions, which velocities are: nothing has stamps"
+            self.out.assumed["time"] = "the log has no stamps; with this step velocities are the slopes of positions"
 
     # ------------------------------------------------------------------------------------------------ columns by number
 
@@ -568,7 +568,7 @@ class _Proposer:
                 columns = tuple(names[start : start + count])
                 block = Family("column_{index}", columns, "", (), numbers, (), (), ("",) * count, ())
                 self._add(name, block, block.entry)
-                self.out.assumed[name] = f"columns {start} to {numbers[-1]}, as velocities are slopes of positions"
+                self.out.assumed[name] = f"columns {start} to {numbers[-1]}: velocities are the slopes of positions"
             self._add_order("joint", block)
             return
 
@@ -582,7 +582,9 @@ class _Proposer:
         other = [x for x in family.units if x and not set(quantities) & set(quantities_with(x))]
         if other and quantities:
             entry["unit"] = FILL_IN
-            self.out.assumed[name] = f"unit '{excerpt(other[0])}' of its columns is none of {' or '.join(quantities)}"
+            self.out.assumed[name] = (
+                f"unit '{excerpt(other[0])}' of its columns is no unit of {' or '.join(quantities)}"
+            )
         elif len(set(family.units)) > 1 and family.kind:
             pairs = zip(family.names, family.units, strict=False)
             entry["unit"] = {joint: unit for joint, unit in pairs if unit}
@@ -608,7 +610,7 @@ class _Proposer:
         if largest > _TURN and not any(family.units):
             of_hinges = {name: "deg" for name, is_hinge in zip(family.names, hinges, strict=False) if is_hinge}
             entry["unit"] = "deg" if hinges.all() else of_hinges
-            self.out.assumed["joint_position"] = f"deg, from values up to {np.nanmax(np.abs(position)):.3g}"
+            self.out.assumed["joint_position"] = f"deg: values reach {np.nanmax(np.abs(position)):.3g}"
         if not self.files and entry.get("unit") in (None, "deg"):
             self._settle_velocities(np.radians(position) if "unit" in entry else position)
 
@@ -626,7 +628,7 @@ class _Proposer:
         ratio = unit_s * float(np.nanmedian(np.diff(stamps[:, 0]))) / max(step, np.finfo(float).tiny)
         if correlation > _MIN_CORRELATION and abs(math.log(ratio * UNITS["angle"]["deg"])) < _MAX_LOG_UNIT_RATIO:
             self.out.columns["joint_velocity"]["unit"] = "deg/s"
-            self.out.assumed["joint_velocity"] = f"deg/s, as they are {ratio:.3g} times the slopes of positions"
+            self.out.assumed["joint_velocity"] = f"deg/s: values are {ratio:.3g} times the slopes of positions"
 
     # ---------------------------------------------------------------------------------------- what a person has to say
 
@@ -634,12 +636,12 @@ class _Proposer:
         """Entries for what a fit needs and nothing says, to be filled in."""
         if not self._known("time"):
             self.out.columns["time"] = {"step": FILL_IN, "unit": "ms"}
-            self.out.assumed["time"] = "between samples, as no column is known to have stamps; or a column: time: NAME"
+            self.out.assumed["time"] = "the step between samples, if no column has stamps; else the column: time: NAME"
         if self.robot.joints and not self._known("joint_position"):
             self.out.columns["joint_position"] = {"column": FILL_IN}
             self.out.assumed["joint_position"] = 'a column or pattern below: an array, "q_{joint}", "q_{index}"'
             order = ", ".join(self.robot.joints)
-            self.out.hint = f"joints of the robot: {order}; joint_order: [...] gives those of numbered columns"
+            self.out.hint = f"joints of the robot: {order}; joint_order: [...] names numbered columns"
         forces = ("joint_torque", *WRENCHES, "contact_force_normal", "ft_wrench")
         if self.robot.joints and not any(map(self._known, forces)):
             self.out.columns["joint_torque"] = {"column": FILL_IN}

@@ -156,7 +156,7 @@ class RobotNames:
         others = [name for name in self.elsewhere if "imu" in name.lower()]
         beyond = f"; {others[0]} is beyond a joint" if others else ""
         return min(named, key=len, default=self.base_link), (
-            "from its name" if named else f"the base link, as no link of it is called imu{beyond}"
+            "the link's name" if named else f"no link of the base is called imu{beyond}"
         )
 
 
@@ -232,9 +232,9 @@ def usual_order(kind: str, robot: RobotNames, count: int) -> tuple[list[str] | s
         if set(order.names) != set(robot.joints):
             continue
         if kind == "joint" and count >= len(order.joints):
-            return maker, f"the order of motors of {maker}, whose joints the robot has"
+            return maker, f"the motor order of {maker}, which has the same joints"
         if kind == "contact" and set(order.feet) == set(robot.feet) and count == len(order.feet):
-            return list(order.feet), f"the order of feet of {maker}, whose joints the robot has"
+            return list(order.feet), f"the order of the feet of {maker}, which has the same joints"
     if count == len(names) > 0:
-        return list(names), "the order of the robot's file, as nothing in the log names them"
+        return list(names), "the order of the robot's file: the log does not name them"
     return None

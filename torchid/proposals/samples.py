@@ -103,7 +103,7 @@ def with_samples_first(sample: FileSample) -> tuple[FileSample, str]:
     if not turned:
         return sample, ""
     others = {name: x for name, x in sample.items() if name not in turned}
-    note = f"the columns of '{excerpt(turned[0])}' are the {count} samples: .T transposes them"
+    note = f"the columns of '{excerpt(turned[0])}' are the {count} samples; .T transposes it"
     return others | {f"{name}{TRANSPOSED}": matrices[name].T for name in turned}, note
 
 
@@ -130,7 +130,7 @@ def find_episodes(sample: FileSample) -> FoundEpisodes | None:
         first = {inner: sample[names[0]] for inner, names in parts.items() if len(names) > 1}
         if any(propose_field(inner).startswith("joint_") for inner in first):
             others = {name: x for name, x in sample.items() if not in_groups(pattern).fullmatch(name)}
-            return FoundEpisodes({"groups": pattern}, others | first, "a recording in each group")
+            return FoundEpisodes({"groups": pattern}, others | first, "each group is one recording")
     joints = {name: x for name, x in sample.items() if x is not None and propose_field(name).startswith("joint_")}
     stacked = sorted(
         (name for name in joints if joints[name].ndim == 3), key=lambda x: propose_field(x) != "joint_position"
@@ -155,7 +155,7 @@ def find_episodes(sample: FileSample) -> FoundEpisodes | None:
     taken = {name: x if x is None or x.dtype.kind not in "fiub" else first_of(x) for name, x in sample.items()}
     entry = {"axis": axis} | ({"lengths": lengths} if lengths else {})
     axes = "(episodes, samples, ...)" if axis == 0 else "(samples, episodes, ...)"
-    return FoundEpisodes(entry, taken, f"{count} recordings side by side, arrays {axes}, as samples change little")
+    return FoundEpisodes(entry, taken, f"{count} recordings in arrays {axes}: neighbouring samples differ little")
 
 
 # --------------------------------------------------------------------------------------------------------- topics

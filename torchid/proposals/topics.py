@@ -67,7 +67,7 @@ class _Proposer:
         if topic.type in JOINT_STATES and topic.messages:
             more = f": joints {join_names(list(topic.messages[0].name))}"
         elif frame := frame_of(topic):
-            more = f": of {frame}"
+            more = f": frame {frame}"
         return f"{name} ({topic.type}){more}"
 
     def _of(self, types: Sequence[str]) -> dict[str, TopicSample]:
@@ -115,7 +115,7 @@ class _Proposer:
         self._add("joint_states", chosen, first, "joint_position")
         if others:
             self.out.columns["other_joint_states"] = [entry if len(entry) > 1 else name for name, entry in others]
-            self.out.assumed["other_joint_states"] = "joints that the messages of joint_states lack"
+            self.out.assumed["other_joint_states"] = "joints that are not in joint_states"
             self.used |= {name for name, _ in others}
 
     def _joint_entry(
@@ -127,7 +127,7 @@ class _Proposer:
             entry["joints"] = [joint for joint in self.robot.joints if joint in matched.values()]
         if called := {text: joint for text, joint in matched.items() if text != joint}:
             entry["names"] = called
-            self.out.assumed.setdefault("joint_states", "one prefix or suffix of the names for another")
+            self.out.assumed.setdefault("joint_states", "names differ only in a prefix or suffix")
         return entry
 
     def _place_low_state(self) -> None:
@@ -137,20 +137,20 @@ class _Proposer:
                 continue
             entry: dict[str, Any] = {"topic": name, "robot": robot}
             same = [x for x in JOINT_ORDERS if JOINT_ORDERS[x] == JOINT_ORDERS[robot]]
-            alike = f"; {', '.join(same)} have one order" if len(same) > 1 else ""
-            self.out.assumed["low_state"] = f"{robot}, as the robot's file has its joints{alike}"
+            alike = f"; {', '.join(same)} have the same order" if len(same) > 1 else ""
+            self.out.assumed["low_state"] = f"{robot}: the robot's file has its joints{alike}"
             self._add("low_state", name, entry, "joint_position", "joint_velocity", "joint_torque")
             if "imu" not in self.out.columns:
                 entry["frame"], _ = self.robot.imu_frame()
                 self.out.fields |= {"imu_specific_force", "imu_angular_velocity"}
-                self.out.assumed["low_state"] += f"; its IMU at {entry['frame']}"
+                self.out.assumed["low_state"] += f"; the IMU is at {entry['frame']}"
             feet = JOINT_ORDERS[robot].feet
             readings = np.array([message.foot_force for message in topic.messages]) if feet else np.zeros(1)
             low, high = np.percentile(readings, (2, 98))
             if set(feet) == set(self.robot.feet) and high > low:
                 entry["above"] = float(f"{low + _TOUCH_READING * (high - low):.2g}")
                 self.out.fields.add("contact_active")
-                self.out.assumed["low_state"] += "; above, from the range of the readings"
+                self.out.assumed["low_state"] += "; above: from the range of the readings"
             return
 
     def _robot_of(self, topic: TopicSample) -> str:
@@ -175,8 +175,8 @@ class _Proposer:
         name = (named or on_base or list(frames))[0]
         frame = frames[name]
         if not on_base:
-            stated = f"'{frame}', which is no link of the base" if frame else "no frame_id"
-            self.out.assumed["imu"] = f"its frame, as the messages have {stated}"
+            stated = f"'{frame}' in the messages is no link of the base" if frame else "the messages have no frame_id"
+            self.out.assumed["imu"] = f"its frame: {stated}"
             frame, _ = self.robot.imu_frame()
         self._add("imu", name, {"topic": name, "frame": frame}, "imu_specific_force", "imu_angular_velocity")
 
@@ -191,7 +191,7 @@ class _Proposer:
         if frames[name] == self.robot.base_link:
             entry["frame"] = frames[name]
         elif frames[name]:
-            self.out.assumed["odometry"] = f"of '{frames[name]}', taken to be the base link"
+            self.out.assumed["odometry"] = f"'{frames[name]}' is taken for the base link"
         twists = [message.twist.twist for message in self.topics[name].messages]
         if not any(getattr(part, axis) for twist in twists for part in (twist.linear, twist.angular) for axis in "xyz"):
             entry["twist"] = "none"
@@ -208,7 +208,7 @@ class _Proposer:
         if known and np.any(turns != turns[0]) and np.allclose(np.linalg.norm(turns, axis=1), 1.0, atol=NORM_TOLERANCE):
             entry["orientation"] = True
             self.out.fields.add("base_quat_xyzw")
-            what = "orientation: the IMU's, an estimate of its own, is that of the base"
+            what = "orientation: the IMU's own estimate is taken for the base's"
             self.out.assumed["imu"] = "; ".join(filter(None, (self.out.assumed.get("imu"), what)))
 
     # ----------------------------------------------------------------------------------------------- limbs, contacts
@@ -229,7 +229,7 @@ class _Proposer:
                 self.used.add(name)
         if entries:
             self.out.columns["ft_wrenches"] = entries
-            self.out.assumed["ft_wrenches"] = "what the parent side exerts on the child side, else sign: -1"
+            self.out.assumed["ft_wrenches"] = "what the parent side exerts on the child side; else add sign: -1"
             self.out.fields.add("ft_wrench")
 
     def _place_by_contact(self, key: str, types: Sequence[str], field: str) -> None:
@@ -246,7 +246,7 @@ class _Proposer:
             entries[foot] = name
             self.used.add(name)
             if frame not in ("", foot):
-                self.out.assumed[key] = "frames of messages are others, taken to be those of the contacts"
+                self.out.assumed[key] = "the messages' frames are taken for the contact frames"
         if entries:
             self.out.columns[key] = {foot: entries[foot] for foot in self.robot.feet if foot in entries}
             self.out.fields.add(field)
@@ -264,7 +264,7 @@ class _Proposer:
         unsaid = [foot for foot in self.robot.feet if foot not in read | flagged]
         if unsaid and (read or flagged):
             columns["contact_active"] = columns.get("contact_active", {}) | dict.fromkeys(unsaid, True)
-            self.out.assumed["contact_active"] = f"{', '.join(unsaid)} touching throughout, as no topic says otherwise"
+            self.out.assumed["contact_active"] = f"{', '.join(unsaid)} always in contact: no topic has flags"
         if read or flagged:
             self.out.fields.add("contact_active")
 

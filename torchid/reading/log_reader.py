@@ -88,7 +88,7 @@ class LogReader:
             ConfigError: settings that leave the cutoff to the logs, where it has not been chosen.
         """
         if setup.config.preprocessing.cutoff_hz == "auto":
-            raise ConfigError.at_field("preprocessing.cutoff_hz", "auto, not yet chosen", "a number [Hz] or null")
+            raise ConfigError.at_field("preprocessing.cutoff_hz", "auto is not chosen yet", "a number [Hz] or null")
         self.setup = setup
         self.folder = _folder_beside(setup.config.output) if folder is None else folder
         self.excluded: dict[str, int] = {}
@@ -124,9 +124,9 @@ class LogReader:
         size_gb = self._size_gb(path)
         self.excluded.pop(str(path), None)
         if size_gb > limit_gb and split_range(path).joins:
-            reason = f"several files with arrays of {size_gb:.2g} GB, which are not in memory at once"
+            reason = f"several files with {size_gb:.2g} GB of arrays do not fit into memory"
             needed = f"a preprocessing.memory_gb above {size_gb:.2g}"
-            raise LogError(path, "file", reason, f"{needed}, or the one file that torchid convert makes of them")
+            raise LogError(path, "file", reason, f"{needed}, or one file from torchid convert")
         has_parts = size_gb > limit_gb or has_blocks(path, None if files is None else files.columns)
         if size_gb > limit_gb / _COPIES and has_parts:
             samples = self._in_parts(path, required)
@@ -139,10 +139,10 @@ class LogReader:
                 self._held_gb = together_gb or samples.nbytes / GIGABYTE  # that of a bag is not known before
         if not len(samples):
             margin_s = self.setup.config.preprocessing.margin_s or 0.0
-            reason = f"no sample further than {margin_s:g} s from a change of contact"
+            reason = f"all samples are within {margin_s:g} s of a change of contact"
             accepted = "a smaller preprocessing.contact_margin_s"
             if self._checks_slip:
-                reason = f"{reason} in which no contact slips"
+                reason = f"{reason}, or a contact slips"
                 accepted = "a larger preprocessing.max_slip, or a smaller contact_margin_s"
             raise LogError(path, "contact_active", reason, accepted)
         return samples
@@ -176,7 +176,7 @@ class LogReader:
         time = blocks.time
         beyond = _overlap(time, settings.filter_hz)
         around = slice(max(piece.start - beyond, 0), min(piece.stop + beyond, len(time)))
-        name = f"{path} (samples {around.start} to {around.stop - 1} of {len(time)}, counted from there)"
+        name = f"{path} (samples {around.start} to {around.stop - 1} of {len(time)}, counted from the first)"
         with about_file(path if around == slice(0, len(time)) else name):
             log = blocks.read(around, settings.exclude_rejected, settings.bridge_gaps_s)
         samples = self.samples_of(log, path, required)
@@ -194,8 +194,8 @@ class LogReader:
         by_feet = settings.base_motion is not None or (settings.detect_contacts is not None and not measured)
         if by_feet and any(contact.normal != UP for contact in self.setup.contacts):
             setting = "detect_contacts" if settings.base_motion is None else "base_motion: contacts"
-            reason = f"unknown, with {setting} on a tilted floor in a log that is not in memory at once"
-            accepted = "the base's orientation or an IMU, a larger preprocessing.memory_gb, or parts of the log"
+            reason = f"unknown: {setting} on a tilted floor needs the whole log in memory"
+            accepted = "the base's orientation or an IMU, a larger preprocessing.memory_gb, or shorter logs"
             raise LogError(blocks.source, "base_quat_xyzw", reason, accepted)
 
     # --------------------------------------------------------------------------------- the steps of a log in memory
@@ -375,8 +375,8 @@ def check_read(logs: Mapping[str, Sequence[Samples]]) -> None:
     train = logs.get("train", ())
     bolted = [log for log in train if log.base.specific_force is None and log.resting is not None]
     if train and len(bolted) == len(train) and all(bool(x.resting.all()) for x in bolted if x.resting is not None):
-        reason = "true, but all joints are at rest, or too near to it for the filter, throughout"
-        raise LogError(train[0].source, "actuators.stiction", reason, "logs whose joints move, or false")
+        reason = "true, but all joints rest in all samples, or are too close to rest for the filter"
+        raise LogError(train[0].source, "actuators.stiction", reason, "logs with moving joints, or false")
     parts = {key: [split_range(log.source) for log in of_key] for key, of_key in logs.items()}
     spans = {split_range(log.source): log.time[[0, -1]].tolist() for of_key in logs.values() for log in of_key}
 

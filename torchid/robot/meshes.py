@@ -50,14 +50,14 @@ class Meshes:
             raise vertices
         self._points_left -= len(vertices)
         if self._points_left < 0:
-            raise MeshError(f"{excerpt(filename)}: shapes of more than {MAX_POINTS} points in all")
+            raise MeshError(f"{excerpt(filename)}: all shapes together have more than {MAX_POINTS} points")
         return vertices
 
 
 def _vertices(urdf: Path, filename: str) -> NDArray[np.float64]:
     path = mesh_path(urdf, filename)
     if _format(path) not in MESH_FORMATS:
-        raise MeshError(f"{excerpt(filename)}: none of {', '.join(MESH_FORMATS)}")
+        raise MeshError(f"{excerpt(filename)}: unknown format; known are {', '.join(MESH_FORMATS)}")
     try:
         with open_apart(_open_mesh, path) as mesh:
             vertices: NDArray[np.float64] = mesh.call("vertices")
@@ -68,7 +68,7 @@ def _vertices(urdf: Path, filename: str) -> NDArray[np.float64]:
     if vertices.shape[1:] != (3,) or not len(vertices):
         raise MeshError(f"{excerpt(filename)}: no vertices")
     if not np.isfinite(vertices).all() or np.abs(vertices).max() > MAX_NUMBER:
-        raise MeshError(f"{excerpt(filename)}: vertices that are no numbers or farther than {MAX_NUMBER:g}")
+        raise MeshError(f"{excerpt(filename)}: vertices are not finite, or beyond {MAX_NUMBER:g}")
     return vertices
 
 
@@ -122,11 +122,11 @@ def mesh_path(urdf: Path, filename: str) -> Path:
         MeshError: there is none.
     """
     if not is_plain(filename):
-        raise MeshError(f"{excerpt(filename)}: no name of a file")
+        raise MeshError(f"{excerpt(filename)}: not a file name")
     package = _package_folder(urdf)
     scheme, _, name = filename.rpartition("://")
     if scheme not in ("", "file", "package"):
-        raise MeshError(f"{excerpt(filename)}: neither a file nor in a package")
+        raise MeshError(f"{excerpt(filename)}: unknown kind of address")
     candidates = (
         _paths_of_package_url(urdf, package, name) if scheme == "package" else _paths_in_package(urdf, package, name)
     )

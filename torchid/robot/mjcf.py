@@ -139,7 +139,7 @@ class MjcfModel:
         """Refuse a scene that takes long to compile, whatever part of it the robot is."""
         count = len(self.spec.bodies)
         if count > _MAX_SCENE_BODIES:
-            raise UrdfError(self.path, "<body>", f"{count} of them", f"at most {_MAX_SCENE_BODIES} in a scene")
+            raise UrdfError(self.path, "<body>", f"{count} bodies", f"at most {_MAX_SCENE_BODIES} in a scene")
 
     def _drop_files(self) -> tuple[list[tuple[Any, MeshShape]], list[Any]]:
         """Drop textures and such meshes as give no body its inertia.
@@ -210,12 +210,12 @@ class MjcfModel:
         dofs = {base: sum(int(model.body_dofnum[i]) for i in below) for base, below in trees.items()}
         most = [base for base in dofs if dofs[base] == max(dofs.values())]
         if len(most) > 1:
-            reason = f"several trees of {max(dofs.values())} degrees of freedom: " + ", ".join(
+            reason = f"several trees with {max(dofs.values())} degrees of freedom: " + ", ".join(
                 self.bodies[x] for x in most
             )
-            raise UrdfError(self.path, "<worldbody>", reason, "one that has more than the others, the robot")
+            raise UrdfError(self.path, "<worldbody>", reason, "one tree (the robot) with more than all others")
         if len(trees[most[0]]) > MAX_LINKS:
-            raise UrdfError(self.path, "<body>", f"{len(trees[most[0]])} of them", f"at most {MAX_LINKS}")
+            raise UrdfError(self.path, "<body>", f"{len(trees[most[0]])} bodies", f"at most {MAX_LINKS}")
         return most[0], trees[most[0]]
 
     def _is_below(self, body: int, root: int) -> bool:
@@ -227,14 +227,14 @@ class MjcfModel:
 @cache
 def _try_to_read(path: Path, _: int) -> None:
     """Let the process with limits read a file first; `_`: when it was written."""
-    accepted = "fewer elements, those of hfield, replicate, composite and attach among them"
+    accepted = "fewer elements, including those of hfield, replicate, composite and attach"
     try:
         with open_apart(_read_mjcf, path):
             pass
     except LogError as error:
         raise UrdfError(path, "MJCF", error.found, f"{accepted}; or {error.accepted}") from error
     except Exception as error:  # noqa: B902 - C++ raises what it likes, mostly as there is no memory
-        reason = f"MuJoCo fails to read it ({excerpt(str(error))})"
+        reason = f"MuJoCo cannot read it ({excerpt(str(error))})"
         raise UrdfError(path, "MJCF", reason, accepted) from error
 
 
@@ -292,7 +292,7 @@ def check_model(model: MjcfModel) -> None:
     for element in model.text.root.iter("inertial"):  # MuJoCo takes a NaN for an attribute that is not there
         if any(word.lower().lstrip("+-") in ("nan", "inf") for x in element.attrib.values() for word in x.split()):
             field = f"<inertial>, line {element.sourceline}"
-            raise UrdfError(model.path, field, "a number that is not finite", "finite numbers")
+            raise UrdfError(model.path, field, "a number is not finite", "finite numbers")
     for body in spec.bodies:
         if body.id in model.members:
             _check_body(model, body)
@@ -309,7 +309,7 @@ def _check_equality(model: MjcfModel, equality: Any) -> None:
     """Refuse all but closed loops, and what attaches the robot to something else."""
     kind = equality_kind(equality)
     if kind not in LOOPS:
-        linear = {"joint": "joint1 = c0 + c1 joint2 alone", "tendon": "one fixed tendon of two joints"}
+        linear = {"joint": "only joint1 = c0 + c1 joint2", "tendon": "one fixed tendon of two joints"}
         accepted = linear.get(kind, "connect, weld, or a linear joint")
         model.refuse(equality, kind, equality.name, "an equality constraint", accepted)
 
@@ -318,7 +318,7 @@ def _check_body(model: MjcfModel, body: Any) -> None:
     if body.gravcomp:
         model.refuse(body, "body", body.name, f"gravcomp {body.gravcomp:g}", "gravcomp 0")
     if body.plugin.active:
-        model.refuse(body, "body", body.name, "a plugin, which may exert forces", "none")
+        model.refuse(body, "body", body.name, "a plugin may exert forces", "no plugin")
     for joint in body.joints:
         _check_joint(model, joint)
         if joint.type.name == "mjJNT_FREE":
@@ -327,14 +327,14 @@ def _check_body(model: MjcfModel, body: Any) -> None:
 
 def _check_joint(model: MjcfModel, joint: Any) -> None:
     if joint.type.name == "mjJNT_BALL":
-        accepted = "joints of type hinge or slide: three hinges in place of a ball"
+        accepted = "hinge or slide; three hinges replace a ball"
         model.refuse(joint, "joint", joint.name, "type ball", accepted)
     values = {name: np.atleast_1d(getattr(joint, name)) for name in ("damping", "stiffness")}
     for name, value in values.items():
         if value[1:].any():
             model.refuse(joint, "joint", joint.name, f"{name} {_numbers(value)}", "one number")
         if np.abs(value).max() > MAX_NUMBER:
-            accepted = f"at most {MAX_NUMBER:g}: no joint, if it cannot move"
+            accepted = f"at most {MAX_NUMBER:g}; remove a joint that cannot move"
             model.refuse(joint, "joint", joint.name, f"{name} {_numbers(value)}", accepted)
 
 
@@ -357,7 +357,7 @@ def _check_transmissions(model: MjcfModel) -> None:
     for actuator in model.spec.actuators:
         for name in ("armature", "damping"):
             if np.any(getattr(actuator, name, 0.0)):  # MuJoCo has them since 3.5
-                accepted = f"{name} of the joint, or none"
+                accepted = f"{name} of the joint, or no {name}"
                 model.refuse(
                     actuator, _actuator_tag(model, actuator), actuator.name, f"{name} of an actuator", accepted
                 )
@@ -369,11 +369,11 @@ def _check_medium(model: MjcfModel) -> None:
         if getattr(option, name):
             element = next((x for x in model.text.root.iter("option") if x.get(name)), None)
             line = "" if element is None else f", line {element.sourceline}"
-            raise UrdfError(model.path, f"<option>{line}", f"{name} {getattr(option, name):g}", f"{name} 0: no fluid")
+            raise UrdfError(model.path, f"<option>{line}", f"{name} {getattr(option, name):g}", f"{name} 0 (no fluid)")
     off = option.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
     gravity = np.zeros(3) if off else option.gravity
     if np.abs(gravity - [0.0, 0.0, -GRAVITY]).max() > _CLOSE:
-        warn(f"{model.path}: gravity {_numbers(gravity)}; the Earth's along -z is used")
+        warn(f"{model.path}: gravity {_numbers(gravity)}; torchid uses the Earth's, along -z")
 
 
 def mimic_of(model: MjcfModel, equality: Any) -> tuple[str, str, float, float] | None:

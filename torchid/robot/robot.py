@@ -56,8 +56,8 @@ if TYPE_CHECKING:
 
 
 _FIRST_GUESS = (
-    "estimator.total_mass in the experiment file, torchid init --total-mass KG, or a guess in each link that moves,"
-    " of its mass [kg] and of the inertia of a ball of its size [kg m^2]: <inertial>"
+    "estimator.total_mass in the experiment file, torchid init --total-mass KG, or a guess in each moving link:"
+    " its mass [kg] and the inertia of a ball of its size [kg m^2]: <inertial>"
     '<mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>'
 )
 
@@ -312,15 +312,15 @@ def load_robot(
         UnphysicalInertiaWarning: a link's inertia belongs to no distribution of positive mass.
     """
     if not isinstance(path, (str, Path)):
-        raise TypeError(f"path: found {type(path).__name__}; accepted: that of a URDF or MJCF file")
+        raise TypeError(f"path: found {type(path).__name__}; accepted: the path of a URDF or MJCF file")
     path = Path(path)
     with during("reading", path):
         links, joints = read_urdf(path)
         if total_mass is not None and not any(link.inertial is not None and link.inertial.mass for link in links):
             spread_mass(path, links, joints, total_mass)
         if not fixed_base and has_fixed_base(path):
-            reason = "none, so that its base is fixed to the world"
-            raise UrdfError(path, "<freejoint>", reason, "robot.fixed_base: true, or a free joint of the base's body")
+            reason = "missing: the base is fixed to the world"
+            raise UrdfError(path, "<freejoint>", reason, "robot.fixed_base: true, or a free joint on the base body")
     welded = weld_positions(path, joints, weld if isinstance(weld, Mapping) else dict.fromkeys(weld, 0.0))
     by_name = {link.name: link for link in links}
     with during("reading", path):
@@ -361,11 +361,11 @@ def _warn_of_massless_ends(path: Path, bodies: tuple[Body, ...]) -> None:
     parents = {body.parent for body in bodies}
     for index, body in enumerate(bodies):
         if body.massless and index not in parents:
-            message = f"{path}: link '{body.name}': no inertia at the end of a limb; its inertia is not fitted"
+            message = f"{path}: link '{body.name}' at the end of a limb has no inertia; its inertia is not fitted"
             warn(message, MasslessBodyWarning)
 
 
-INERTIA_ACCEPTED = "ixx, ixy, ixz, iyy, iyz, izz [kg m^2] about the payload's centre of mass, of a body that can be"
+INERTIA_ACCEPTED = "ixx, ixy, ixz, iyy, iyz, izz [kg m^2] about the payload's centre of mass, physically consistent"
 
 
 @pydantic.dataclasses.dataclass(config=STRICT, frozen=True)
@@ -414,12 +414,12 @@ def payload_parameters(robot: Robot, payloads: Sequence[Payload], recording: str
     for payload in payloads:
         body, T_body_link = robot.link(payload.link, f"payload.link{where}")
         if parameters.consistency_margin(payload.about_center) < parameters.POSSIBLE_MARGIN:
-            reason = f"{list(payload.inertia)}, which no body has"
+            reason = f"{list(payload.inertia)} is not physically consistent"
             raise ConfigError.at_field(f"payload.inertia{where}", reason, INERTIA_ACCEPTED)
         if robot.bodies[body].massless:
-            reason = f"'{payload.link}', of a body without mass in the {robot.format}"
+            reason = f"the body of '{payload.link}' has no mass in the {robot.format}"
             raise ConfigError.at_field(
-                f"payload.link{where}", reason, "a link of a body with mass, or an <inertial> for it"
+                f"payload.link{where}", reason, "a link on a body with mass, or an <inertial> for this one"
             )
         added[body, parameters.INERTIAL] += parameters.change_of_frame(T_body_link) @ payload.inertial
     return added.flatten()
@@ -489,13 +489,13 @@ def mirror_pairs(
         accepted = "mirror images when all joints are at 0"
         off = float(np.linalg.norm(D @ T[i, :3, 3] - T[j, :3, 3]))
         if off > MIRROR_TOLERANCE * size:
-            reason = f"{pair} are {off:.3g} m from being mirror images along {normal} in a robot of {size:.3g} m"
-            raise ConfigError.at_field(field, reason, f"{accepted}, to {MIRROR_TOLERANCE * size:.2g} m")
+            reason = f"{pair} miss being mirror images along {normal} by {off:.3g} m, in a robot of {size:.3g} m"
+            raise ConfigError.at_field(field, reason, f"{accepted}, within {MIRROR_TOLERANCE * size:.2g} m")
         aslant = _angle(robot, T, D, i, j)
         if aslant > MIRROR_TOLERANCE:
             raise ConfigError.at_field(field, f"the joints of {pair} are {aslant:.3g} rad off", accepted)
         if robot.bodies[i].massless != robot.bodies[j].massless:
-            raise ConfigError.at_field(field, f"of {pair} one has no mass", "two bodies that have")
+            raise ConfigError.at_field(field, f"one of {pair} has no mass", "two bodies with mass")
         out.append(MirrorPair(i, j, T[j, :3, :3].T @ D @ T[i, :3, :3]))
     return tuple(out)
 
@@ -505,7 +505,7 @@ def _by_name(
 ) -> list[tuple[int, int]]:
     """Indices of bodies whose names answer to each other."""
     if left == right:
-        raise ConfigError.at_field(field, f"'{left}' on both sides", "two different parts of names")
+        raise ConfigError.at_field(field, f"'{left}' for both sides", "different parts of names for left and right")
     images = {name: _images(name, left, right, names) for name in names}
     for name, counterparts in images.items():
         expected = _exchanged(name, left, right)

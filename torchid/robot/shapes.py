@@ -107,7 +107,7 @@ def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[in
         else:
             extents[index] = extent
     _warn_without_extent(robot.path, "no shapes", shapeless, [])
-    _warn_without_extent(robot.path, "a mesh that cannot be read", unreadable, reasons)
+    _warn_without_extent(robot.path, "unreadable mesh", unreadable, reasons)
     return extents
 
 
@@ -125,7 +125,7 @@ def _link_shapes(meshes: Meshes, link: etree._Element, prefer: ShapeKind) -> lis
         if elements:
             field = f"link '{link.get('name')}', <{tag}>"
             if len(elements) > MAX_SHAPES:
-                raise UrdfError(meshes.urdf, field, f"{len(elements)} of them", f"at most {MAX_SHAPES}")
+                raise UrdfError(meshes.urdf, field, f"{len(elements)} shapes", f"at most {MAX_SHAPES}")
             return [read_shape(meshes, field, element) for element in elements]
     return []
 

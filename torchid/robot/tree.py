@@ -138,8 +138,8 @@ def _find_root(path: Path, links: list[Link], joints: list[TreeJoint]) -> str:
     parent: dict[str, str] = {}
     for joint in joints:
         if joint.child in parent:
-            reason = f"child of joint '{joint.name}' and of another joint"
-            raise UrdfError(path, f"link '{joint.child}'", reason, "one parent for each link: a tree without loops")
+            reason = f"two joints have this child, one is '{joint.name}'"
+            raise UrdfError(path, f"link '{joint.child}'", reason, "one parent per link: a tree without loops")
         parent[joint.child] = joint.parent
     roots = [link.name for link in links if link.name not in parent]
     reached = set(roots[:1])
@@ -153,7 +153,10 @@ def _find_root(path: Path, links: list[Link], joints: list[TreeJoint]) -> str:
             queue.append(child)
     if len(roots) > 1:
         raise UrdfError(
-            path, "tree", f"several root links: {', '.join(roots[:4])}", "one link that is no joint's child"
+            path,
+            "tree",
+            f"several root links: {', '.join(roots[:4])}",
+            "one link without a parent joint",
         )
     if len(reached) < len(links):
         unreached = next(link.name for link in links if link.name not in reached)
@@ -178,12 +181,15 @@ def resolve_mimics(path: Path, joints: Sequence[TreeJoint]) -> dict[str, Mimic]:
             master = by_name[master.mimic.joint]
             if master.name in visited:
                 raise UrdfError(
-                    path, f"joint '{joint.name}', <mimic>", "a chain that closes on itself", "a free master"
+                    path,
+                    f"joint '{joint.name}', <mimic>",
+                    "mimic joints form a loop",
+                    "a free master",
                 )
             visited.add(master.name)
         _check_mimic_size(path, joint.name, multiplier, offset)
         if master.type not in MOVING_TYPES:
-            reason = f"its mimic master '{master.name}' is fixed, so that it is fixed too"
+            reason = f"its mimic master '{master.name}' is fixed, so this joint is fixed too"
             warn(f"{path}: joint '{joint.name}': {reason}")
         resolved[joint.name] = Mimic(master.name if master.type in MOVING_TYPES else "", multiplier, offset)
     return resolved
@@ -276,7 +282,7 @@ def spread_mass(path: Path, links: Sequence[Link], joints: Sequence[TreeJoint], 
         T_link_ball = np.eye(4)
         T_link_ball[:3, 3] = np.mean(places, axis=0)
         link.inertial = Inertial(T_link_ball, mass, inertia)
-    warn(f"{path}: no link has mass; {total:g} kg are spread evenly over {len(heavy)} links, as balls of water")
+    warn(f"{path}: no link has mass; {len(heavy)} links share {total:g} kg equally, as balls of water")
 
 
 def nominal_parameters(path: Path, tree: BodyTree, links: dict[str, Link]) -> Array:
@@ -302,8 +308,8 @@ def nominal_parameters(path: Path, tree: BodyTree, links: dict[str, Link]) -> Ar
             nominal[body, parameters.FRICTION] = joint.friction, joint.damping
     for name, what in list(unphysical.items())[:1]:
         others = join_names([other for other in unphysical if other != name])
-        what += f", and the inertia of {others} is no body's either" if others else ""
-        warn(f"{path}: link '{name}': {what}; used as written", UnphysicalInertiaWarning)
+        what += f"; also physically inconsistent: {others}" if others else ""
+        warn(f"{path}: link '{name}': {what}; it is used as it is", UnphysicalInertiaWarning)
     return nominal
 
 
@@ -323,11 +329,11 @@ def _unphysical(inertial: Inertial) -> str:
     if large == small == inertial.mass == 0.0:
         return ""
     if inertial.mass == 0.0:
-        return "mass 0 kg with an inertia that is not 0"
+        return "the mass is 0, but the inertia is not"
     if small < -_INERTIA_ROUNDING * large - _POINT * inertial.mass:
-        return f"principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m^2 are not all positive"
+        return f"principal inertias ({small:.3g}, {middle:.3g}, {large:.3g} kg m^2) must be positive"
     if large > (small + middle) * (1.0 + _TRIANGLE_TOLERANCE) + _POINT * inertial.mass:
-        return f"largest principal inertia {large:.3g} exceeds the sum of the others, {small + middle:.3g} kg m^2"
+        return f"the largest principal inertia ({large:.3g} kg m^2) exceeds the sum of the others, {small + middle:.3g}"
     return ""
 
 
@@ -429,14 +435,14 @@ def weld_positions(path: Path, joints: Sequence[TreeJoint], weld: Mapping[str, f
     mimics = {name: mimic for name, mimic in resolve_mimics(path, joints).items() if mimic.master}
     for name, (key, _) in stated.items():
         if name in mimics and mimics[name].master not in stated:
-            reason = f"joint '{name}', which follows '{mimics[name].master}', which moves"
-            raise ConfigError.at_field(_field(key), reason, "its master too")
+            reason = f"joint '{name}' follows '{mimics[name].master}', which moves"
+            raise ConfigError.at_field(_field(key), reason, "also its master joint")
     limits = position_limits(path)
     for name, (key, position) in stated.items():
         low, high = limits.get(name, (-np.inf, np.inf))
         if name not in mimics and not low - _POSITION_ROUNDING <= position <= high + _POSITION_ROUNDING:
-            reason = f"{position:g}, outside of the limits of joint '{name}'"
-            accepted = f"a position from {low:g} to {high:g}: weld: {{'{name}': {(low + high) / 2:.4g}}}"
+            reason = f"{position:g} is outside the limits of joint '{name}'"
+            accepted = f"a position from {low:g} to {high:g}, such as weld: {{'{name}': {(low + high) / 2:.4g}}}"
             raise ConfigError.at_field(_field(key), reason, accepted)
     welded = {}
     for name in moving:
@@ -446,7 +452,7 @@ def weld_positions(path: Path, joints: Sequence[TreeJoint], weld: Mapping[str, f
         elif mimic is not None and mimic.master in stated:
             welded[name] = mimic.multiplier * stated[mimic.master][1] + mimic.offset
     if len(welded) == len(moving):
-        raise ConfigError.at_field(WELD_FIELD, "every joint that moves", "patterns that leave a joint")
+        raise ConfigError.at_field(WELD_FIELD, "fixes every joint", "patterns that leave a joint free")
     return welded
 
 
@@ -460,8 +466,8 @@ def _stated(
         for name in matching_joints(WELD_FIELD, key, moving, names):
             other, before = stated.setdefault(name, (key, position))
             if before != position:
-                reason = f"{position:g} for joint '{name}', which '{other}' holds at {before:g}"
-                raise ConfigError.at_field(_field(key), reason, "one position for a joint")
+                reason = f"{position:g} for joint '{name}', but '{other}' says {before:g}"
+                raise ConfigError.at_field(_field(key), reason, "one position per joint")
     return stated
 
 
@@ -482,7 +488,7 @@ def matching_joints(field: str, key: str, moving: Iterable[str], names: Iterable
     moving = list(moving)
     matches = [name for name in moving if (fnmatchcase(name, key) if pattern else name == key)]
     if not matches and pattern:
-        raise ConfigError.at_field(field, f"'{key}' matches no joint that moves", f"among {join_names(moving)}")
+        raise ConfigError.at_field(field, f"'{key}' matches no joint that moves", f"a pattern for {join_names(moving)}")
     if not matches:
         raise UnknownNameError.at_field(field, key, moving, "a fixed joint" if key in names else "")
     return matches
@@ -569,11 +575,11 @@ def loops_of_file(path: Path) -> tuple[Loop, ...]:
     """
     root = parse_xml(path).getroot()
     for attachment in root.findall(f"{OWN}attachment"):
-        held = "holds the robot to what is no part of it, by a force that is left out"
+        held = "attaches the robot to something else; torchid ignores this force"
         contact = (
             f"{{frame: {attachment.get('frame')}, type: {'point' if attachment.get('type') == 'point' else 'flat'}}}"
         )
-        warn(f"{path}: {attachment.get('where')}: {held}; where it acted in a log: contacts: [{contact}]")
+        warn(f"{path}: {attachment.get('where')}: {held}. If it acted in a log, set contacts: [{contact}]")
     loops = root.findall(f"{OWN}loop")
     return tuple(Loop((str(x.get("one")), str(x.get("other"))), str(x.get("type"))) for x in loops)
 
@@ -596,8 +602,8 @@ def validate_loops(loops: Sequence[Loop], links: Mapping[str, tuple[int, Array]]
                 raise UnknownNameError.at_field(field, frame, links)
         first, second = loop.frames
         if links[first][0] == links[second][0]:
-            reason = f"{first} and {second}, frames of one body, which no joint moves"
-            raise ConfigError.at_field(field, reason, "frames of two bodies that joints move relative to each other")
+            reason = f"{first} and {second} are on the same body"
+            raise ConfigError.at_field(field, reason, "frames on two bodies that move relative to each other")
 
 
 def passive_joints(joints: Sequence[TreeJoint], names: Sequence[str] | None, moving: Iterable[str]) -> tuple[str, ...]:

@@ -149,7 +149,7 @@ def _read_elements(path: Path) -> etree._Element:
     for tag in ("link", "joint"):
         count = len(root.findall(tag))
         if count > MAX_LINKS:
-            raise UrdfError(path, tag, f"{count} of them", f"at most {MAX_LINKS}")
+            raise UrdfError(path, tag, f"{count} {tag}s", f"at most {MAX_LINKS}")
     stripped = etree.Element("robot", name=root.get("name", path.stem))
     for element in root:
         kept = _KEPT.get(str(element.tag))
@@ -164,8 +164,8 @@ def _refuse_xacro(path: Path, root: etree._Element) -> None:
     for element in root.iter(etree.Element):
         name = f"{element.prefix}:{etree.QName(element).localname}" if element.prefix else str(element.tag)
         if name.startswith("xacro:"):
-            reason = f"xacro that is not expanded, in line {element.sourceline}"
-            raise UrdfError(path, f"<{excerpt(name)}>", reason, "the URDF that `xacro FILE.urdf.xacro` prints")
+            reason = f"xacro is not expanded (line {element.sourceline})"
+            raise UrdfError(path, f"<{excerpt(name)}>", reason, "the output of `xacro FILE.urdf.xacro`")
 
 
 def _check_names(path: Path, root: etree._Element) -> None:
@@ -209,7 +209,7 @@ def _check_numbers(path: Path, owner: etree._Element) -> None:
 
 def _check_size(path: Path, field: str, numbers: list[float]) -> None:
     if not all(map(math.isfinite, numbers)):
-        raise UrdfError(path, field, "a number that is not finite", "finite numbers")
+        raise UrdfError(path, field, "a number is not finite", "finite numbers")
     largest = max(map(abs, numbers))
     if largest > MAX_NUMBER:
         raise UrdfError(path, field, f"a number of size {largest:.3g}", f"numbers of at most {MAX_NUMBER:g}")
@@ -245,7 +245,7 @@ def _check_link(path: Path, link: etree._Element) -> None:
     mass = inertial.find("mass")
     inertia = inertial.find("inertia")
     if mass is None or mass.get("value") is None:
-        raise UrdfError(path, field, "no <mass value=...>", "a mass [kg], or no <inertial> at all")
+        raise UrdfError(path, field, "no <mass value=...>", "a mass [kg], or no <inertial>")
     missing = _INERTIA_ATTRIBUTES if inertia is None else [a for a in _INERTIA_ATTRIBUTES if inertia.get(a) is None]
     if missing:
         raise UrdfError(path, field, f"no {', '.join(missing)}", "all six numbers of <inertia> [kg m^2]")

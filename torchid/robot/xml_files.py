@@ -181,7 +181,7 @@ class MjcfText:
         if len(self._files) >= _MOST_FILES:
             raise UrdfError(self.path, "<include>", f"more than {_MOST_FILES} files", "fewer")
         if path in self._files:
-            raise UrdfError(self.path, "<include>", f"{path.name} more than once", "every file once")
+            raise UrdfError(self.path, "<include>", f"{path.name} is included twice", "every file once")
         self._files[path] = read_xml(path, root).getroot()
         out = copy.deepcopy(self._files[path])
         for include in list(out.iter("include")):
@@ -198,7 +198,7 @@ class MjcfText:
         included = next((path for path in (by.parent / file, self.path.parent / file) if path.is_file()), None)
         if included is None:
             accepted = f"a file beside {' or '.join(dict.fromkeys((by.name, self.path.name)))}"
-            raise UrdfError(by, "<include>", f"'{excerpt(file)}', which is not there", accepted)
+            raise UrdfError(by, "<include>", f"'{excerpt(file)}' does not exist", accepted)
         return included
 
 
