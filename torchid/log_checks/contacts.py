@@ -182,7 +182,7 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
 def _gravity_finding(mean: float, size: float, text: str, units: tuple[str, ...], rests: bool) -> Finding | None:
     """Finding about the unit or the gravity of a reading, by the size of its mean and its median size [m/s^2].
 
-    Both are gravity's for a base that hardly turns and falls; of one without gravity, the mean is nearly zero.
+    Both equal gravity if the base hardly turns and accelerates; without gravity the mean is nearly zero.
     """
     field = "imu_specific_force"
     original = "give the raw reading of the accelerometer"
@@ -202,9 +202,9 @@ def _gravity_finding(mean: float, size: float, text: str, units: tuple[str, ...]
 
 
 def _mean_along_world(log: Log, robot: Robot | None) -> tuple[float, float] | None:
-    """Size of the mean along the world's axes, twice; None where that is not known, or the base turns over.
+    """Size of the mean along the world's axes, twice; None if it is unknown, or the base turns over.
 
-    That mean is gravity however the base accelerates: its velocity does not grow.
+    This mean is gravity even if the base accelerates, as its velocity does not grow.
     """
     in_base = _specific_force_in_base(log, robot)
     if in_base is None or log.base_quat_xyzw is None:
@@ -217,7 +217,7 @@ def _mean_along_world(log: Log, robot: Robot | None) -> tuple[float, float] | No
 
 
 def _specific_force_in_base(log: Log, robot: Robot | None) -> FloatArray | None:
-    """What the accelerometer reads along the axes of the base (N, 3); None where it is not known to be on the base."""
+    """The accelerometer's readings along the axes of the base (N, 3); None if it is not on the base."""
     if log.imu_specific_force is None or robot is None or robot.links.get(log.imu_frame, (1, None))[0] != 0:
         return None
     return np.asarray(log.imu_specific_force @ robot.links[log.imu_frame][1][:3, :3].T)
@@ -392,7 +392,7 @@ def _largest_load(contacts: list[_Contact]) -> float:
 
 
 def _load_without_flags(contacts: list[_Contact], robot: Robot | None) -> float:
-    """Median total contact force [N] whatever the flags say; 0 where it is far from carrying the robot."""
+    """Median total contact force [N] without regard to flags; 0 if it is far below the robot's weight."""
     if robot is None:
         return 0.0
     total = np.sum([np.nan_to_num(np.linalg.norm(contact.force, axis=1)) for contact in contacts], axis=0)
@@ -602,7 +602,7 @@ def _contacts_beyond(robot: Robot, contacts: Sequence[Contact], name: str) -> li
 
 
 def _turned_sensor(measured: FloatArray, model: FloatArray) -> str | None:
-    """The quarter turn that makes measured forces (M, 3) those of the model, in words, if they are not without one."""
+    """The rotation by right angles that makes measured forces (M, 3) fit the model, in words; None without one."""
 
     def misfit(forces: FloatArray) -> float:
         return float(np.linalg.norm(forces - model)) / max(float(np.linalg.norm(model)), 1e-9)

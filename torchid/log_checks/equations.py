@@ -1,4 +1,4 @@
-"""What the forces of a log say beside every URDF near the given one: equations, and unknowns estimated in them."""
+"""Force equations of a log, and unknowns estimated in them together with small changes of the URDF."""
 
 from __future__ import annotations
 
@@ -70,14 +70,14 @@ _LEAST_STEP = 2e-3
 
 @dataclass(frozen=True, eq=False)
 class Declared:
-    """What an experiment says of its sensors and actuators, for which no log is to blame.
+    """Noise, delay and extra terms that an experiment declares; no finding blames a log for them.
 
     Attributes:
-        noise: standard deviations of the readings, NaN where none is stated; None: nowhere.
-        terms: extra parameters that are fitted, as offsets and scales of sensors.
-        delay: how much later than recorded joint torques act [s]; `AUTO`: to be found.
-        finds_tilt: whether the tilt of the base is to be found.
-        goes_on_without_base: whether a fit goes on where the base is lost.
+        noise: standard deviations of the readings, NaN if not stated; None: none is stated.
+        terms: extra parameters of the fit, such as offsets and scales of sensors.
+        delay: delay of the joint torques behind their stamps [s]; `AUTO`: the fit estimates it.
+        finds_tilt: whether the fit estimates the tilt of the base.
+        goes_on_without_base: whether a fit continues where the base is lost.
     """
 
     noise: SensorNoise | None = None
@@ -88,22 +88,22 @@ class Declared:
 
     @property
     def known_delay(self) -> float:
-        """The delay [s], 0 where it is to be found."""
+        """The delay [s], 0 if the fit estimates it."""
         return 0.0 if isinstance(self.delay, str) else self.delay
 
 
 @dataclass(frozen=True, eq=False)
 class NominalModel:
-    """A robot as its file has it, its contacts, and what is declared of its sensors.
+    """A robot with the parameters of its file, its contacts, and the declared properties of its sensors.
 
     Attributes:
         robot: the robot.
         contacts: of it.
-        declared: what is known of its sensors.
+        declared: declared properties of its sensors.
         reading_noise: of the torques of its joints from sample to sample, (n,) [N m or N].
         scale_std: standard deviation of the prior of declared scales.
-        torque_ratio: size of the torques that act over that of their readings.
-        unknown: inertial parameters, (L, 12), that the file does not tell.
+        torque_ratio: size of the acting torques over the size of their readings.
+        unknown: mask (L, 12) of inertial parameters that the file does not give.
     """
 
     robot: Robot
@@ -116,7 +116,7 @@ class NominalModel:
 
     @cached_property
     def phi(self) -> FloatArray:
-        """Parameters (1, 12 L) without friction: of that, files state anything."""
+        """Parameters (1, 12 L) without friction: values in files are arbitrary."""
         nominal = self.robot.nominal.copy()
         nominal[:, parameters.FRICTION] = 0.0
         if self.unknown is not None:
@@ -125,7 +125,7 @@ class NominalModel:
 
     @property
     def is_bolted_arm(self) -> bool:
-        """Whether torques are those of joints, of gravity and inertia alone."""
+        """Whether the robot is a fixed-base arm without contacts and loops."""
         return self.robot.fixed_base and not self.contacts and not self.robot.loops
 
 
@@ -135,7 +135,7 @@ class FilteredLog:
 
     Attributes:
         log: as it was read.
-        model: robot, contacts, and what is declared.
+        model: robot, contacts and declared properties.
         cutoff_hz: of the filter.
     """
 
@@ -155,12 +155,12 @@ class FilteredLog:
 
 
 def default_cutoff_hz(log: Log) -> float:
-    """The cutoff [Hz] where the user gives none."""
+    """The default cutoff [Hz]."""
     return usual_cutoff_hz(1.0 / median_step(log))
 
 
 def preprocess_pieces(log: Log, cutoff_hz: float, max_samples: int = MAX_DIFFERENTIATED_SAMPLES) -> list[Log]:
-    """The log with velocities and accelerations; of one longer than `max_samples`, evenly spread runs of samples.
+    """The log with velocities and accelerations; of a log with more than `max_samples`, evenly spread runs.
 
     Raises:
         InputError: the log cannot be filtered.
@@ -195,7 +195,7 @@ def some_samples(logs: Sequence[Samples], count: int = COMPARED_SAMPLES) -> Samp
 def equations_of(
     pieces: Sequence[Log], model: NominalModel, count: int = COMPARED_SAMPLES, builder: RowBuilder | None = None
 ) -> ForceEquations | None:
-    """Equations of filtered runs of a log, None where no force was measured; `builder` as of `ForceEquations.of`.
+    """Equations of filtered runs of a log, None if no force was measured; `builder` as in `ForceEquations.of`.
 
     Raises:
         InputError: the log does not match the robot.
@@ -205,13 +205,13 @@ def equations_of(
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Unknowns estimated beside all that may differ from the URDF.
+    """Unknowns estimated together with small changes of the URDF.
 
     Attributes:
         value, spread: (k,), of the whole log, and their standard deviations.
         blocks: (TIME_BLOCKS, k), by block of time.
-        without, left: forces that the best URDF near the given one leaves unexplained without the unknowns and with
-            them, rms in `UNMODELLED_FORCE_SHARE` of the forces.
+        without, left: unexplained forces of the best URDF near the given one, without and with the unknowns, rms in
+            `UNMODELLED_FORCE_SHARE` of the forces.
     """
 
     value: FloatArray
@@ -222,12 +222,12 @@ class Estimate:
 
     @property
     def certain(self) -> BoolArray:
-        """Unknowns (k,) that are not 0 by their standard deviations."""
+        """Unknowns (k,) that differ from 0 significantly."""
         return np.asarray(np.abs(self.value) > MIN_STANDARD_DEVIATIONS * self.spread)
 
     @property
     def steady(self) -> BoolArray:
-        """Unknowns (k,) that every block of time shows."""
+        """Unknowns (k,) that appear in every block of time."""
         return np.asarray((self.blocks * np.sign(self.value) > MIN_BLOCK_SHARE * np.abs(self.value)).all(axis=0))
 
     def of(self, which: BoolArray) -> Estimate:
@@ -237,7 +237,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class ReducedEquations:
-    """Products of what the nominal parameters leave and of k unknowns' columns, without what may differ from the URDF.
+    """Products of the nominal residual and the columns of k unknowns, with changes of the URDF eliminated.
 
     `products`: (1 + TIME_BLOCKS, 1 + k, 1 + k), of all samples and of each block of time. `rows`: number of equations.
     """
@@ -247,14 +247,14 @@ class ReducedEquations:
 
     @property
     def left(self) -> float:
-        """What is unexplained without the unknowns."""
+        """Unexplained forces without the unknowns."""
         return self._rms(float(self.products[0, 0, 0]))
 
     def _rms(self, squares: float) -> float:
         return float(np.sqrt(max(squares, 0.0) / max(self.rows, 1)))
 
     def fit(self, which: Sequence[int] | NDArray[np.intp], prior_std: FloatArray | float) -> Estimate:
-        """Some of the unknowns, with the standard deviations of their prior."""
+        """Estimate some of the unknowns, with the standard deviations of their prior."""
         index = np.append(0, 1 + np.asarray(which, np.intp))
         precision = np.diag(CORRELATED_SAMPLES / np.square(np.broadcast_to(prior_std, len(which))))
         G = self.products[:, index[:, None], index]
@@ -271,11 +271,12 @@ class ReducedEquations:
         return replace(self, products=self.products[:, index[:, None], index])
 
     def reverse_gains(self, gain: FloatArray, applied: FloatArray | float = 1.0) -> FloatArray:
-        """Gains (k,) of the columns where all that is not explained is in them, beside those of a fit (Frisch, 1934).
+        """Gains (k,) of the reverse regression, with all errors in the columns (Frisch, 1934).
 
-        `applied`: gains that the readings have got.
+        `applied`: gains already applied to the readings.
 
-        The truth is between both: far apart where friction or armature that the URDF lacks explain the readings.
+        The true gains are between these and those of `fit`; both differ much if unmodelled friction or armature explain
+        the readings.
         """
         whole = np.eye(len(gain) + 1)
         whole[1:, 0] = applied  # what the gains make up: unknowns are gains less 1
@@ -288,14 +289,14 @@ class ReducedEquations:
 
 @dataclass(frozen=True, eq=False)
 class ForceEquations:
-    """Whitened equations of some samples: what the URDF leaves of the forces, and all that may differ from it.
+    """Whitened equations of some samples: the residual of the URDF, and columns of its possible changes.
 
     Attributes:
-        model, builder, samples: that they are of.
+        model, builder, samples: their source.
         W: (N, n_rows, r) bases of the rows.
         K: (N, r, P) columns of parameters, friction and armature, in standard deviations of their prior.
         constants: (N, r, n) the same of constant torques.
-        target: (N, r) what the nominal parameters leave.
+        target: (N, r) residual of the nominal parameters.
         rows: number of equations.
     """
 
@@ -313,7 +314,7 @@ class ForceEquations:
     def of(cls, samples: Samples, model: NominalModel, builder: RowBuilder | None = None) -> ForceEquations | None:
         """The equations of the forces that were measured in all samples, None without any.
 
-        `builder`: whose layouts and noise are kept where the same forces were measured.
+        `builder`: its layouts and noise are used again if the same forces were measured.
         """
         sensors = _measured_sensors(samples, model)
         if not (sensors.torque & ~model.robot.is_passive)[: model.robot.n].any() and not sensors.wrench.any():
@@ -344,7 +345,7 @@ class ForceEquations:
 
     @cached_property
     def unexplained(self) -> float:
-        """What the best URDF near the given one leaves of the forces, rms in `UNMODELLED_FORCE_SHARE` of them."""
+        """Unexplained forces of the best URDF near the given one, rms in `UNMODELLED_FORCE_SHARE` of the forces."""
         A, b = self._all_that_may_differ
         projected = A.T @ b
         squares = b @ b - projected @ np.linalg.solve(A.T @ A + CORRELATED_SAMPLES * np.eye(A.shape[1]), projected)
@@ -352,7 +353,7 @@ class ForceEquations:
 
     @property
     def _all_that_may_differ(self) -> tuple[FloatArray, FloatArray]:
-        """Columns (N r, P + n) of all that may differ from the URDF, and what the nominal parameters leave, (N r,)."""
+        """Columns (N r, P + n) of the URDF's possible changes, and the residual of the nominal parameters, (N r,)."""
         K = np.concatenate([self.K, self.constants], axis=2)
         return K.reshape(-1, K.shape[2]), self.target.reshape(-1)
 
@@ -370,7 +371,7 @@ class ForceEquations:
         return {}
 
     def _differing(self, constants: bool) -> tuple[FloatArray, list[FloatArray]]:
-        """Columns of what may differ, and inverse normal matrices of all samples and of each block."""
+        """Columns of the URDF's possible changes, and inverse normal matrices of all samples and of each block."""
         if constants not in self._inverses:
             K = np.concatenate([self.K, self.constants], axis=2) if constants else self.K
             parts = [K[block].reshape(-1, K.shape[2]) for block in self._blocks]
@@ -387,7 +388,7 @@ class ForceEquations:
         return np.array_split(np.arange(len(self.target)), TIME_BLOCKS)
 
     def reduced(self, columns: FloatArray, constants: bool = True) -> ReducedEquations:
-        """Equations of unknowns by their columns (N, n_rows, k) alone; `constants`: beside constant torques."""
+        """Equations of unknowns with columns (N, n_rows, k); `constants`: with constant torques as further unknowns."""
         Y = np.concatenate([self.target[..., None], np.einsum("nvr,nvk->nrk", self.W, columns)], axis=2)
         K, inverses = self._differing(constants)
         products = []
@@ -400,12 +401,12 @@ class ForceEquations:
         return ReducedEquations(np.array(reduced), self.rows)
 
     def _deviations(self) -> FloatArray:
-        """All that may differ from the URDF, (P + n,), in standard deviations of its prior, as it fits best."""
+        """The best fitting changes of the URDF, (P + n,), in standard deviations of their prior."""
         A, b = self._all_that_may_differ
         return np.asarray(np.linalg.solve(A.T @ A + CORRELATED_SAMPLES * np.eye(A.shape[1]), A.T @ b), np.float64)
 
     def torque_ratio(self) -> float:
-        """Size of the torques that the nominal parameters need over that of the readings, where both tell of it."""
+        """Size of the torques that the nominal parameters need over the size of the readings, where both are known."""
         n = self.model.robot.n
         base = self.builder.tree.base_rows
         readings = np.nan_to_num(self.builder.recorded_torque(self.samples)[:, :n].numpy())
@@ -414,12 +415,12 @@ class ForceEquations:
         return float(np.linalg.norm(self.target + read)) / size if size > 0.0 else 1.0
 
     def residuals(self) -> FloatArray:
-        """What the best URDF near the given one leaves of each equation, (N, r)."""
+        """Residual of each equation for the best URDF near the given one, (N, r)."""
         A, b = self._all_that_may_differ
         return np.asarray((b - A @ self._deviations()).reshape(self.target.shape))
 
     def declared_torque_scales(self) -> FloatArray:
-        """Factors (n,) by which torques of a bolted arm with a declared unknown scale are as large as required."""
+        """Factors (n,) that make a fixed-base arm's torques with a declared unknown scale as large as required."""
         n = self.model.robot.n
         readings = np.nan_to_num(self.builder.recorded_torque(self.samples)[:, :n].numpy())
         required = self.required
@@ -433,7 +434,7 @@ class ForceEquations:
 
 
 def _joint_term(torque_rows: FloatArray, value: torch.Tensor, scale: float) -> FloatArray:
-    """Columns of joint torques in proportion to values (N, n), scaled by the prior whatever the size of the values."""
+    """Columns of joint torques in proportion to values (N, n), scaled by the prior and independent of their size."""
     columns = torque_rows.transpose(0, 2, 1) * value.numpy()[:, None]
     size = np.sqrt(np.square(columns).mean(axis=(0, 1)))
     return np.asarray(scale * columns / np.where(size > 0.0, size, 1.0))
@@ -468,7 +469,7 @@ def _prior_columns(builder: RowBuilder, samples: Samples, model: NominalModel) -
 
 
 def _size_of_unknown_body(robot: Robot) -> FloatArray:
-    """Parameters, (12,), as large as those of a body of the usual mass that is a fifth of the robot long."""
+    """Typical parameters, (12,), of a body with the usual mass and a fifth of the robot's length."""
     masses = np.abs(robot.nominal[:, parameters.MASS])
     mass = float(np.median(masses[masses > 0.0]))
     length = max(0.2 * reach(robot), 0.01)
@@ -489,9 +490,9 @@ def reach(robot: Robot) -> float:
 
 
 def _measured_sensors(samples: Samples, model: NominalModel) -> SensorSet:
-    """The sensors that were read in all samples; their noise is the unmodelled force of each kind, or more if stated.
+    """The sensors that were read in all samples; their noise is at least the unmodelled force of each kind.
 
-    Of a torque that is the geometric mean of the shares of its own size and of all torques' size; the latter where
+    For a torque this is the geometric mean of the shares of its own size and of all torques' size; only the latter if
     torques have unknown scales.
     """
     robot = model.robot
@@ -531,7 +532,7 @@ def _unmodelled(size: FloatArray | float) -> FloatArray:
 
 
 def reading_noise(log: Log, robot: Robot) -> FloatArray:
-    """Standard deviation of each joint's torque readings from sample to sample, (n,), 0 where it is not known."""
+    """Sample-to-sample standard deviation of each joint's torque readings, (n,), 0 if unknown."""
     noise = np.zeros(robot.n)
     for name, column in zip(log.joint_names, np.asarray(log.joint_torque).T, strict=True):
         known = column[np.isfinite(column)]
@@ -553,15 +554,15 @@ class Kind:
     Attributes:
         columns: of the unknowns, (N, n_rows, k).
         prior_std: of the unknowns, (k,) or of each.
-        is_large: which unknowns (k,) are large enough to be named.
-        findings: about unknowns that are named, by their numbers and estimate.
-        moved: equations and columns of the log without the unknowns (k,), where columns hold for small ones alone.
-        bounded: whether unknowns are gains less 1, which must be large by either regression, and these agree.
-        single: whether one unknown alone is wrong.
-        constants: whether there may be constant torques beside them.
-        together: size of groups of successive unknowns that are named together.
+        is_large: which unknowns (k,) are large enough for a finding.
+        findings: of the large unknowns, from their numbers and estimate.
+        moved: equations and columns of the log corrected by the unknowns (k,), if the columns hold only for small ones.
+        bounded: whether unknowns are gains less 1; both regressions must find them large, and agree.
+        single: whether only one unknown is wrong.
+        constants: whether constant torques are estimated, too.
+        together: size of groups of successive unknowns with one finding.
         steady: whether every block of time must show the unknowns.
-        equations: that the columns are of, None: those of the log.
+        equations: of the columns, None: those of the log.
     """
 
     columns: FloatArray
@@ -579,7 +580,7 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Findings about a mistake, and what the forces leave unexplained without it.
+    """Findings about a mistake, and the unexplained forces after its correction.
 
     `value`: (count,), of its `count` unknowns.
     """
@@ -591,7 +592,7 @@ class Explanation:
 
 
 def explain(equations: ForceEquations, kind: Kind) -> Explanation | None:
-    """What clear unknowns of a kind explain; None without any."""
+    """The explanation of the forces by significant unknowns of a kind; None without any."""
     equations = kind.equations or equations
     reduced = equations.reduced(kind.columns, kind.constants)
     count = kind.columns.shape[2]
@@ -627,7 +628,7 @@ def _prior(kind: Kind, which: NDArray[np.intp]) -> FloatArray:
 
 
 def _possible(kind: Kind, which: NDArray[np.intp], reduced: ReducedEquations, estimate: Estimate) -> BoolArray:
-    """Which of some unknowns may be named; of a lag, which a corrected log makes clearer, half as much suffices."""
+    """Which of some unknowns may be reported; half the size suffices for a lag, as a corrected log makes it clearer."""
     if kind.moved is None or kind.columns.shape[2] > kind.together or kind.bounded:
         return _named(kind, which, reduced, estimate, estimate.certain)
     near = replace(estimate, value=2.0 * estimate.value)
@@ -642,9 +643,9 @@ def _named(
     certain: BoolArray,
     applied: FloatArray | None = None,
 ) -> BoolArray:
-    """Which of some unknowns are `certain` and large, in groups of those that belong together.
+    """Which of some unknowns are `certain` and large, by groups of `kind.together` unknowns.
 
-    `applied`: gains that the readings have got; None before a last estimate, by which gains must be clear.
+    `applied`: gains already applied to the readings; None before the last estimate, in which gains must be clear.
     """
     named = certain & kind.is_large(estimate.value)
     if kind.bounded and len(which):
@@ -660,10 +661,10 @@ def _named(
 
 
 def _are_apart_from_1(gain: FloatArray, reverse: FloatArray) -> BoolArray:
-    """Which gains by two regressions, between which the truth is, are so close to each other that it is not 1.
+    """Which gains differ from 1: the true gain is between the two regressions, which must be close to each other.
 
-    Of gains of one sign on the same side of 1 the further one may be the third power of the other: torques that
-    armature makes up, which URDFs seldom state, have 0.13 and 0.75. Negative ones may be as far apart as reversed ones.
+    On the same side of 1, the farther gain may be the third power of the nearer one: torques mostly from armature, which
+    URDFs rarely state, have 0.13 and 0.75. Negative gains may differ by `FACTOR_TOLERANCE_RATIO` squared.
     """
     logs = np.log(np.maximum(np.abs([gain, reverse]), 1e-12))
     least = np.where(gain < 0.0, np.log(FACTOR_TOLERANCE_RATIO), np.abs(logs).min(axis=0))
@@ -673,9 +674,9 @@ def _are_apart_from_1(gain: FloatArray, reverse: FloatArray) -> BoolArray:
 def _corrected(
     kind: Kind, which: NDArray[np.intp], first: Estimate, reduced: ReducedEquations, total: FloatArray
 ) -> tuple[Estimate, ReducedEquations]:
-    """The estimate by a log whose unknowns are corrected by what is estimated, until nothing is left of them.
+    """The estimate after repeated corrections of the log by the estimated unknowns, until these vanish.
 
-    `total`: gets what the log was corrected by, (k,).
+    `total`: receives the sum of the corrections, (k,).
     """
     estimate = first
     step = first.value

@@ -1,4 +1,4 @@
-"""Measured forces against the URDF's: what a fit would refuse, and the mistake that explains them best."""
+"""Measured forces against the URDF: refusals of a fit, and the mistake that explains the forces best."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def check_required(
         robot: the robot.
         contacts: of it.
         required: sensors of the fit.
-        goes_on: whether it goes on where the base is lost.
+        goes_on: whether the fit continues where the base is lost.
     """
     try:
         require_forces(samples, robot, contacts, required)
@@ -159,7 +159,7 @@ def check_forces_against_urdf(
         robot: the robot.
         contacts: of it.
         cutoff_hz: of the fit, None for a usual one.
-        derived: how names of fields begin that were not recorded and hold no mistake of a recording.
+        derived: prefixes of fields that torchid computed.
         declared: what is known of the sensors.
         required: sensors of a fit, which must be in the log.
     """
@@ -192,12 +192,12 @@ def check_forces_against_urdf(
 
 
 def _has_scaled_torques(model: NominalModel) -> bool:
-    """Whether the sizes of an arm's torques with declared unknown scales are those that its URDF requires."""
+    """Whether an arm's torques with declared unknown scales are scaled to the size that its URDF requires."""
     return "joint_torque" in model.declared.terms.scales and model.is_bolted_arm
 
 
 def _with_declared_scales(filtered: FilteredLog) -> FilteredLog:
-    """The log of a bolted arm with torques times factors by which those with a declared scale are as large as required.
+    """The log of a fixed-base arm; torques with a declared unknown scale are scaled to the size that the URDF requires.
 
     Equations are weighted by the size of the readings.
     """
@@ -212,7 +212,7 @@ def _with_declared_scales(filtered: FilteredLog) -> FilteredLog:
 
 
 def _mistakes(filtered: FilteredLog, equations: ForceEquations, derived: tuple[str, ...]) -> Iterator[Finding]:
-    """The mistake that explains the forces best, of the file or the log, or that they contradict the URDF."""
+    """Findings about the mistake of the file or the log that explains the forces best, or about a contradiction."""
     if backward := list(_driving_friction(filtered, equations)):
         yield from backward
         return
@@ -236,7 +236,7 @@ def _mistakes(filtered: FilteredLog, equations: ForceEquations, derived: tuple[s
 
 
 def _with_found_delay(filtered: FilteredLog, derived: tuple[str, ...]) -> FilteredLog:
-    """The log without the delay of its torques, where a fit is to find it and it explains the forces best."""
+    """The log without the delay of its torques, if the fit estimates it and it explains the forces best."""
     best = best_explanation(filtered, derived) if filtered.model.declared.delay == AUTO else None
     if best is None or (best.findings[0].name, best.findings[0].field) != ("delay", "joint_torque"):
         return filtered
@@ -256,12 +256,12 @@ def _mistakes_of_log(filtered: FilteredLog, equations: ForceEquations, derived: 
 
 @dataclass(frozen=True)
 class ImplausibleBody:
-    """A body with a mass or an inertia that no body of a robot has.
+    """A body with an implausible mass or inertia.
 
     Attributes:
         number: of the body.
         fault: what is wrong.
-        of_mass: whether that may be the mass; else it is the inertia.
+        of_mass: whether the mass may be wrong; else only the inertia.
     """
 
     number: int
@@ -270,7 +270,7 @@ class ImplausibleBody:
 
 
 def implausible_bodies(robot: Robot) -> Iterator[ImplausibleBody]:
-    """Bodies with a mass or an inertia that no body of a robot has, by the robot's file alone."""
+    """Implausible masses and inertias in the robot's file."""
     mass = robot.nominal[:, parameters.MASS]
     total = float(np.abs(mass).sum())
     length = reach(robot)
@@ -326,7 +326,7 @@ def _contradiction(unexplained: float, model: NominalModel) -> Finding:
 
 
 def _usual_mistake(filtered: FilteredLog, equations: ForceEquations, derived: tuple[str, ...]) -> Explanation | None:
-    """The usual mistake of the motion without which a URDF near the given one explains the forces much better."""
+    """The usual mistake of the motion whose correction explains the forces much better."""
     log = filtered.log
     model = filtered.model
     unexplained = equations.unexplained
@@ -355,7 +355,7 @@ def _usual_mistake(filtered: FilteredLog, equations: ForceEquations, derived: tu
 
 
 def _corrected(mistake: Mistake, filtered: FilteredLog, equations: ForceEquations) -> ForceEquations | None:
-    """Equations of some samples of the log without a mistake."""
+    """Equations of some samples of the corrected log."""
     if _has_scaled_torques(filtered.model):
         corrected = FilteredLog(mistake.correct(filtered.log), filtered.model, filtered.cutoff_hz)
         return _with_declared_scales(corrected).equations
@@ -391,7 +391,7 @@ def _driving_friction(filtered: FilteredLog, equations: ForceEquations) -> Itera
 
 
 def _dead_encoders(filtered: FilteredLog, equations: ForceEquations) -> Iterator[Finding]:
-    """Joints that stand still with a torque that no joint at rest needs; a note where friction may hold them."""
+    """Findings about joints at rest with an unexplained torque; notes if friction may hold them."""
     robot = filtered.model.robot
     readings = equations.samples.torque
     still = still_joints(filtered.log)

@@ -304,7 +304,7 @@ def _reverse_joint(joint: int) -> Callable[[Log], Log]:
 
 
 def joint_mistakes(log: Log) -> Iterator[Mistake]:
-    """Single joints of an arm or a hand that are counted the other way, or from another right angle."""
+    """Single joints of an arm or a hand with a reversed sign, or a zero off by a right angle."""
     if len(log.joint_names) > _MAX_SINGLE_JOINTS:
         return
     for joint, name in enumerate(log.joint_names):
@@ -402,7 +402,7 @@ def _wrench_mistakes(field: str, other: str) -> Iterator[Mistake]:
 
 
 def _turn_world(turn: Rotation) -> Callable[[Log], Log]:
-    """A log in a world frame that is turned."""
+    """A log in a rotated world frame."""
     R = turn.as_matrix()
     x, y, z, w = turn.as_quat()
     times_quaternion = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])

@@ -416,7 +416,7 @@ _MIN_TRAVEL_RATIO = 10.0
 
 
 def still_joints(log: Log) -> tuple[str, ...]:
-    """Joints whose positions never move beyond their noise, while others do."""
+    """Joints that never move by more than their noise, while others do."""
     position = log.joint_position
     if len(log) < 2 or not position.size or np.ptp(position, axis=0).max() <= MIN_MOTION:
         return ()
@@ -456,6 +456,6 @@ def joints_of_limb(robot: Robot, frame: str) -> list[str]:
 
 
 def still_in_limb(log: Log, robot: Robot, frame: str) -> list[str]:
-    """The joints between the base and a link that stand still in the log."""
+    """The joints between the base and a link that never move in the log."""
     still = still_joints(log)
     return [name for name in joints_of_limb(robot, frame) if name in still]

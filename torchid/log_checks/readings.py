@@ -445,7 +445,7 @@ def _mean_hold(values: FloatArray, repeated: BoolArray) -> float:
 
 
 def new_poses(log: Log) -> Log:
-    """The log at samples with new positions, of joints or else of the base, where these are held at a lower rate."""
+    """The log at samples with new positions of the joints, or else of the base, if these are held at a lower rate."""
     for group in channel_groups(log, ("joint_position", "base_quat_xyzw")):
         together = (np.diff(group.values, axis=0) == 0.0).all(axis=1) & group.joined
         changing = group.values[:, np.ptp(group.values, axis=0) > 0.0]
@@ -472,7 +472,7 @@ def _estimate_resolution(values: FloatArray) -> float:
 
 
 def _implausible_runs(values: FloatArray, repeated: BoolArray) -> Runs:
-    """Runs of steps without change (M - 1,) in all channels (M, c) that neither chance nor rest explains."""
+    """Runs of steps without change (M - 1,) in all channels (M, c), not explained by chance or rest."""
     runs = Runs.of_repeats(repeated)
     if not 0 < len(runs) <= _MAX_RUNS:
         return runs.select(np.zeros(len(runs), bool))

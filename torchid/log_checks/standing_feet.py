@@ -1,4 +1,4 @@
-"""Feet that stand: what they show of orientation, joints, names, radii and the base's pose."""
+"""Standing feet: checks of orientation, joints, names, radii and the base's pose."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def _pose_findings(log: Log, contacts: Sequence[Contact], slip: float, poses: Li
     recorded = Slerp(log.time, Rotation.from_quat(quat))
 
     def motion(x: FloatArray) -> FloatArray:
-        """Deviations of standing feet from where they are on average [m], flat, if the pose is corrected by x."""
+        """Deviations of standing feet from their mean places [m], flat, with the pose corrected by x."""
         at = np.clip(log.time + x[6], log.time[0], log.time[-1])
         R = (recorded(at) * Rotation.from_rotvec(x[3:6]).inv()).as_matrix()
         origin = np.stack([np.interp(at, log.time, axis) for axis in place.T], axis=1) - R @ x[:3]
@@ -256,7 +256,7 @@ def _radius_findings(log: Log, robot: Robot, contacts: Sequence[Contact], poses:
 
 
 def _rolling_windows(log: Log, points: Sequence[Contact], poses: LinkPoses) -> Iterator[tuple[float, float, float]]:
-    """Mean squares, in short windows, of how vectors between standing points move, beside how unit balls would roll.
+    """Mean squares of the motion of vectors between standing points, in short windows, against rolling unit balls.
 
     Mean square of the first [m^2], mean product [m], mean square of the second: the vectors move by the radius times
     the second where feet roll, see `measure_foot_slip`.
@@ -310,7 +310,7 @@ def measure_foot_slip(
 
 
 def _rolled(log: Log, contact: Contact, T_base_foot: FloatArray) -> FloatArray:
-    """How far a foot would have rolled along the ground since the log began, (N, 3) [m]; 0 for one that does not."""
+    """Rolled distance of a foot along the ground since the log's start, (N, 3) [m]; 0 for feet that do not roll."""
     quat = log.base_quat_xyzw
     if not contact.radius or quat is None:
         return np.zeros((len(log), 3))

@@ -252,7 +252,7 @@ def _is_reverse(x: FloatArray) -> BoolArray:
 
 
 def _is_whole(x: FloatArray) -> BoolArray:
-    """Which shares (k,) of a change are all of it."""
+    """Which shares (k,) of a change are about 1."""
     return np.asarray(np.abs(x - 1.0) < _SHARE_TOLERANCE)
 
 
@@ -562,7 +562,8 @@ def _turned(samples: Samples, axis: int) -> Samples:
 class _Clock:
     """Readings that may be late together.
 
-    `what` is later or earlier `than`; `field` and `channels` of a finding; `moved`: channels of the fields of a log.
+    The text is `what`, later or earlier, `than`; `field` and `channels` are those of the finding; `moved`: channels of
+    the fields of a log.
     """
 
     what: str
@@ -573,7 +574,7 @@ class _Clock:
 
 
 def _clocks(filtered: FilteredLog, derived: tuple[str, ...]) -> Iterator[_Clock]:
-    """What may be late. The joints' motion needs a third clock beside theirs and that of the forces."""
+    """Readings that may be late. A lag of the joints' motion needs a third clock besides joints and forces."""
     log = filtered.log
     every = slice(None)
     has_wrench = log.contact_wrench is not None and len(filtered.model.contacts) > 0
@@ -654,7 +655,7 @@ def _lag_kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[
 
 
 def _is_changing_lag(x: FloatArray) -> BoolArray:
-    """Whether lags, (2,) or fewer, of the middle and changes over the log, change by as much as is reported."""
+    """Whether the change of a lag, the second of (2,) lags, is large enough to report."""
     return np.asarray((np.arange(len(x)) == 1) & (np.abs(x) > MIN_LAG_CHANGE_S))
 
 
