@@ -69,13 +69,13 @@ def test_a_bag_of_every_type_is_read_as_it_was_recorded(tmp_path: Path, capsys: 
         "contact_wrenches": {foot: f"/wrench/{foot}" for foot in feet},
         "contact_active": {foot: f"/touch/{foot}" for foot in feet},
     }
-    assert "odometry: of 'base', taken to be the base link" in said.assumed
+    assert "odometry: 'base' is taken for the base link" in said.assumed
     np.testing.assert_array_equal(again.joint_torque, log.joint_torque)
     order = [again.contact_names.index(name) for name in log.contact_names]
     np.testing.assert_array_equal(np.asarray(again.contact_active)[:, order], log.contact_active)
     text = path.with_suffix(".yaml").read_text()
     assert "  topics:  # what the messages of the bag hold: docs/logs.md\n    joint_states: /joint_states\n" in text
-    assert "    # assumed: of 'base', taken to be the base link\n    odometry: {" in text
+    assert "    # assumed: 'base' is taken for the base link\n    odometry: {" in text
     (tmp_path / "x.yaml").unlink()
     assert main(["init", str(URDF), str(path), "--output", str(tmp_path / "x.yaml")]) == 0
     assert (

@@ -149,7 +149,7 @@ def test_a_step_has_no_column_beside_it_and_makes_up_no_positions(tmp_path: Path
             "joint_position: missing",
         ),
         ({**MAP, "time": {"step": 0.01, "column": "time"}, "ignore": ["time"]}, "column and step together"),
-        ({**MAP, "time": {"step": 0.01, "scale": 2}, "ignore": ["time"]}, "scale beside step"),
+        ({**MAP, "time": {"step": 0.01, "scale": 2}, "ignore": ["time"]}, "scale has no effect together with step"),
     ):
         columns = Columns(joint_order=["hip", "knee"], **{k: x for k, x in given.items() if k != "joint_order"})  # type: ignore[arg-type]
         with pytest.raises(InputError, match=found):
@@ -173,7 +173,7 @@ def test_stamps_in_two_columns_are_seconds_and_nanoseconds(tmp_path: Path, name:
     with open_log_blocks(path, tmp_path, columns) as blocks:
         np.testing.assert_array_equal(blocks.time, log.time)
     for entry, found in (
-        ({"step": 5, "nanoseconds": "stamp.nsec"}, "time: nanoseconds beside step"),
+        ({"step": 5, "nanoseconds": "stamp.nsec"}, "time: nanoseconds has no effect together with step"),
         (time | {"nanoseconds": "stamp.nanosec"}, "time.nanoseconds: unknown name 'stamp.nanosec'|'stamp.nanosec'"),
         ({"nanoseconds": "stamp.nsec"}, "time: has no column"),
     ):

@@ -142,9 +142,9 @@ def test_an_odometry_is_that_of_the_base_link_if_the_map_names_its_frame_and_els
         return read_messages(tmp_path / "x.mcap", entries, odometry={"topic": "/odom", "frame": frame})
 
     meant = r"; set logs\.topics\.odometry\.frame to confirm it$"
-    with pytest.warns(TorchidWarning, match=f"/odom: frame 'camera', taken to be the robot's base link{meant}"):
+    with pytest.warns(TorchidWarning, match=f"/odom: frame 'camera' is taken for the robot's base link{meant}"):
         read("camera", None)
-    with pytest.warns(TorchidWarning, match=f"/odom: frame '/camera', taken to be 'pelvis'{meant}"):
+    with pytest.warns(TorchidWarning, match=f"/odom: frame '/camera' is taken for 'pelvis'{meant}"):
         read("/camera", "pelvis")
     for child, frame in (("hip", "hip"), ("/hip", "hip"), ("hip", "/hip"), ("", None), ("", "hip")):
         assert read(child, frame).base_position_world is not None
@@ -211,7 +211,7 @@ def test_wrenches_are_the_environments_and_the_parents_action_unless_a_sign_says
 def test_a_limbs_wrench_is_in_the_child_frame_if_the_map_names_it_and_else_warned_of(tmp_path: Path) -> None:
     """Which link the fixed joint carries a bag does not know: the sensor may read along the parent's axes."""
     entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, np.ones(6), "shin")) for s in map(int, STAMPS)]
-    taken = r"/w: frame 'shin', taken to be the child frame of joint 'ft'; logs\.topics\.ft_wrenches\.ft\.frame says"
+    taken = r"/w: frame 'shin' is taken for the child frame of joint 'ft'; set logs\.topics\.ft_wrenches\.ft\.frame to"
     with pytest.warns(TorchidWarning, match=taken) as caught:
         read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": "/w"})
     assert len(caught) == 1
@@ -254,10 +254,12 @@ def test_contacts_without_a_wrench_say_themselves_when_they_touch(tmp_path: Path
 
 def test_wrenches_in_a_frame_of_another_name_are_warned_of_unless_that_is_meant(tmp_path: Path) -> None:
     entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, np.ones(6), "/sensor")) for s in map(int, STAMPS)]
-    with pytest.warns(TorchidWarning, match=r"/w: frame '/sensor', taken to be 'sole'; logs.topics.contact_wrenches"):
+    with pytest.warns(
+        TorchidWarning, match=r"/w: frame '/sensor' is taken for 'sole'; set logs.topics.contact_wrenches"
+    ):
         read_messages(tmp_path / "x.mcap", entries, contact_wrenches={"sole": "/w"}, contact_force_threshold=1.0)
     meant = {"sole": {"topic": "/w", "frame": "sensor"}}
     read_messages(tmp_path / "x.mcap", entries, contact_wrenches=meant, contact_force_threshold=1.0)
     read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": {"topic": "/w", "frame": "/sensor"}})
-    with pytest.warns(TorchidWarning, match="/w: frame '/sensor', taken to be 'other'"):
+    with pytest.warns(TorchidWarning, match="/w: frame '/sensor' is taken for 'other'"):
         read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": {"topic": "/w", "frame": "other"}})

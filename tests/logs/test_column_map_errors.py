@@ -26,7 +26,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         'joint_position: "p_{index}"',
         {},
-        "logs.columns.joint_position: 'p_0', no such column (nor 1 more); accepted: q_0",
+        "logs.columns.joint_position: 'p_0', no such column (1 more are missing); accepted: q_0",
     ),
     (
         'joint_position: "{joint}_pos"',
@@ -37,15 +37,19 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         POSITION + "joint_velocity: q_0",
         {},
-        "joint_velocity: column 'q_0', which logs.columns.joint_position has already",
+        "joint_velocity: column 'q_0' is already in logs.columns.joint_position",
     ),
-    ("joint_position: {columns: {a: q_0, b: q_0}}\nignore: [q_1]", {}, "which logs.columns.joint_position has already"),
+    (
+        "joint_position: {columns: {a: q_0, b: q_0}}\nignore: [q_1]",
+        {},
+        "column 'q_0' is already in logs.columns.joint_position",
+    ),
     ('joint_position: {column: "q_{index}", order: [a, b, a]}', {}, "joint_position.order: 'a' twice; accepted: every"),
     ('joint_position: "q_{index}"', {}, "joint_position.order: missing; accepted: names of the joints in the order"),
     ('joint_position: {column: "q_{index}", order: [a]}', {}, "no entry for q_1; accepted: an entry"),
     (POSITION, {"w": TIME, "t2": TIME, "x[3]": TIME}, "no entry for w, t2, x[3]; accepted"),
     (POSITION + 'joint_torque: {column: "t{index}", order: [hip, foot]}', {"t0": TIME, "t1": TIME}, "joint 'foot' mis"),
-    (POSITION + "joint_torque: q_0", {}, "which logs.columns.joint_position has already"),
+    (POSITION + "joint_torque: q_0", {}, "column 'q_0' is already in logs.columns.joint_position"),
     ('joint_position: {column: "q_{index}", order: [a, b], unit: grad}', {}, "unit: 'grad', an unknown unit; accepted"),
     ('joint_position: {column: "q_{index}", order: [a, b], unit: rpm}', {}, "'rpm', a unit of angular velocity; acc"),
     (
@@ -67,7 +71,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         QUAT + "{rpy: {columns: {roll: q_0}}}",
         {},
-        "rpy.columns: components roll; accepted: each of",
+        "rpy.columns: components roll; accepted: all of",
     ),
     (
         QUAT + "{rpy: {column: q_0, unit: rpm}}",
@@ -104,7 +108,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         POSITION + "joint_torque: {pd: {kp: {hip: 3}, position: 'r_{index}'}}",
         {"r_0": TIME, "r_1": TIME},
-        "no gain of knee",
+        "no gain for knee",
     ),
     (
         POSITION + "joint_torque: {pd: {kp: {q: 3}, position: 'r_{index}'}}",
@@ -115,7 +119,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         POSITION + "joint_torque: {current: {column: 'r_{index}', torque_constant: {hip: 1}, gear_ratio: 9}}",
         {"r_0": TIME, "r_1": TIME},
-        "joint_torque.current.torque_constant: no torque constant of knee; accepted: one for every joint",
+        "joint_torque.current.torque_constant: no torque constant for knee; accepted: one for every joint",
     ),
     (
         POSITION + "joint_torque: {current: {column: 'r_{index}', unit: N m, torque_constant: 1, gear_ratio: 9}}",
@@ -127,7 +131,11 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
         {},
         "joint_torque.current: has no column; accepted: one of column, columns",
     ),
-    (POSITION + "contact_active: {above: 3}", {}, "contact_active.above: set, without a force; accepted: a column"),
+    (
+        POSITION + "contact_active: {above: 3}",
+        {},
+        "contact_active.above: nothing to compare with it; accepted: a column",
+    ),
     (
         POSITION + "contact_active: {above: 3, always: [a]}",
         {},
@@ -139,7 +147,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
         "contact_force_normal: given without contact_act",
     ),
     (POSITION + "imu_frame: imu", {}, "imu_frame: given without imu_specific_force"),
-    (POSITION + "imu_specific_force: {columns: {x: q_0}}", {}, "columns: components x; accepted: each of x, y, z"),
+    (POSITION + "imu_specific_force: {columns: {x: q_0}}", {}, "columns: components x; accepted: all of x, y, z"),
     (
         POSITION,
         {"joint_position__hip": TIME, "joint_position__knee": TIME},
@@ -183,7 +191,7 @@ BAD_ARRAYS: list[tuple[str, dict[str, Any], str]] = [
     (ORDER + "joint_position: q", {"q": np.array([["a", "b"]] * 3)}, "'q': values of type <U1; accepted: real numbers"),
     (ORDER + "joint_position: q", {"q": np.array(1.0)}, "'q': a single value"),
     (ORDER + "joint_position: q", {"q": np.ones((2, 3))}, "'q': shape (N, 3); accepted: (N, 2), one per name of"),
-    (ORDER + "joint_position: q.T", {"q": np.ones((2, 3, 1))}, "'q.T': a 3-dimensional array; accepted: one of"),
+    (ORDER + "joint_position: q.T", {"q": np.ones((2, 3, 1))}, "'q.T': a 3-dimensional array; accepted: a 2-dim"),
     (ORDER + "joint_position: p.T", {}, "logs.columns.joint_position: 'p.T', no such column; accepted: "),
     (ORDER + "joint_position: \"q['a']\"", {}, "'q['a']': an array of shape (N, 2); accepted: an array of records"),
     (
@@ -267,7 +275,7 @@ def test_groups_of_hdf5_that_contain_themselves_are_refused(tmp_path: Path) -> N
                 file[f"{name}/{inner}"] = file["/"]
         file["soft"] = h5py.SoftLink("/a")
     message = refused(lambda: read_log(path, columns=Columns(time="a/time")), f"{path}: ", LogError)
-    assert "more than the 20000 that a log may have" in message
+    assert "20004 arrays and groups; a log may have 20000" in message
     with h5py.File(path, "w") as file:
         file["time"], file["joint_names"] = TIME, ["a"]
         file["joint_position"], file["empty"] = np.ones((3, 1)), h5py.SoftLink("/time")

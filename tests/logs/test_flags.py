@@ -47,7 +47,7 @@ def test_a_force_between_both_thresholds_keeps_its_flag() -> None:
     assert without_short(flags, 1).tolist() == flags.tolist()
 
 
-@pytest.mark.filterwarnings("ignore:.*the messages have no stamps:torchid.errors.TorchidWarning")
+@pytest.mark.filterwarnings("ignore:.*no stamps in the messages:torchid.errors.TorchidWarning")
 @pytest.mark.parametrize(
     ("suffix", "sensor"),
     [

@@ -194,7 +194,7 @@ def test_what_no_frame_can_be_found_by_is_refused_in_one_line(tmp_path: Path) ->
 
 
 BAD_MAPS = [
-    ("plates: {l_sole: {}}", "no plate of r_sole; accepted: one for every contact; * stands for all others"),
+    ("plates: {l_sole: {}}", "no plate for r_sole; accepted: one for every contact; * stands for all others"),
     ("plates: {l_sole: {}, r_sole: {}, foot: {}}", "logs.columns.plates: unknown name 'foot'; accepted: r_sole, l_sol"),
     ('plates: {"*": {}}\ncontact_wrench_world: null', "logs.columns.plates: given without logs.columns.contact_wrench"),
     ('plates: {"*": {}}\ncontact_wrench_point_world: {column: "FP{index}_M{axis}", unit: N}', "a unit of force; acce"),

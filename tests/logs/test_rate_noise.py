@@ -47,7 +47,7 @@ def test_a_joint_whose_acceleration_is_noise_is_named_with_the_share_that_is() -
 
 def test_the_cutoff_that_is_proposed_is_low_enough() -> None:
     log = swinging(SIGMA)
-    proposed = float(said(log, cutoff_hz=20.0).split("a cutoff of ")[1].split(" Hz")[0])
+    proposed = float(said(log, cutoff_hz=20.0).split("set cutoff_hz: ")[1].split(" if")[0])
     assert 2.0 < proposed < 20.0
     assert said(log, cutoff_hz=proposed) == ""
 

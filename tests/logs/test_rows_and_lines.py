@@ -38,7 +38,7 @@ def test_a_row_that_is_there_twice_counts_once_and_two_that_differ_are_refused(t
     with pytest.warns(TorchidWarning, match="1 row with the same joint and stamp as another: ignored"):
         log = read_log(written(tmp_path / "x.csv", ROWS + "0.1,b,4,x\n"), columns=COLUMNS)
     np.testing.assert_array_equal(log.joint_position, [[1, 2], [3, 4]])
-    with pytest.raises(LogError, match=r"column 'joint': two rows of 'b' at 0\.1, with two of 'q'"):
+    with pytest.raises(LogError, match=r"column 'joint': two rows of 'b' at 0\.1 differ in 'q'"):
         read_log(written(tmp_path / "y.csv", ROWS + "0.1,b,5,x\n"), columns=COLUMNS)
 
 

@@ -86,7 +86,7 @@ def test_a_pair_that_is_not_mirrored_is_refused_with_the_distance(tmp_path: Path
     robot = mirrored_robot(tmp_path, np.random.default_rng(2), lower=np.array([0.0, 0.03, 0.04]))
     message = refusal(robot, "left", "right")
     assert "left_lower and right_lower miss being mirror images along y by 0.05 m, in a robot of " in message
-    assert "left_upper and right_upper are " in refusal(robot, "left", "right", normal="z")
+    assert "left_upper and right_upper miss being " in refusal(robot, "left", "right", normal="z")
     near = mirrored_robot(tmp_path, np.random.default_rng(2), lower=np.array([0.0, 0.0, 1e-4]))
     assert len(mirror_pairs(near, "left", "right")) == 2
 
@@ -105,7 +105,7 @@ def arms(folder: Path, *bodies: str) -> Robot:
 @table({
     "nothing": (["l_arm", "r_arm"], ("links", "rechts"),
                 "no two bodies differ in 'links' and 'rechts'; accepted: parts of names: shell_link, l_arm, r_arm"),
-    "equal": (["l_arm", "r_arm"], ("l_", "l_"), "'l_' on both sides"),
+    "equal": (["l_arm", "r_arm"], ("l_", "l_"), "'l_' for both sides"),
     "alone": (["l_arm", "r_arm", "l_leg"], ("l_", "r_"), "l_leg has no counterpart; accepted: a body named r_leg"),
     "alone, right": (["l_arm", "r_arm", "r_leg"], ("l_", "r_"), "r_leg has no counterpart"),
     "two": (["l_l", "r_l", "l_r"], ("l", "r"), "l_l corresponds to r_l and to l_r"),
@@ -117,11 +117,11 @@ def test_names_that_do_not_answer_to_each_other_are_refused(case: tuple, tmp_pat
 
 def test_joints_that_are_not_mirrored_are_refused_with_the_angle(tmp_path: Path) -> None:
     robot = mirrored_robot(tmp_path, np.random.default_rng(3), upper_axis=np.array([0.5, 0.0, 0.0]))
-    assert "the joints of left_upper and right_upper are " in refusal(robot, "left", "right")
+    assert "the joints of left_upper and right_upper miss being " in refusal(robot, "left", "right")
 
 
 def test_a_pair_of_which_one_has_no_mass_is_refused(tmp_path: Path) -> None:
     origin = '<origin xyz="0 {} 0"/><axis xyz="0 0 1"/>'
     elements = [link("trunk"), link("l_arm"), link("r_arm", "")]
     joints = [joint(f"{s}_joint", "trunk", f"{s}_arm", extra=origin.format(y)) for s, y in (("l", 1), ("r", -1))]
-    assert "of l_arm and r_arm one has no mass" in refusal(load(write(tmp_path, *elements, *joints)), "l_", "r_")
+    assert "one of l_arm and r_arm has no mass" in refusal(load(write(tmp_path, *elements, *joints)), "l_", "r_")

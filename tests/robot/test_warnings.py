@@ -18,7 +18,7 @@ from torchid.robot import load_robot
 @pytest.mark.parametrize(
     ("element", "expected"),
     [
-        (inertial(ixx="0.3"), "largest principal inertia 0.3 exceeds the sum of the others, 0.2"),
+        (inertial(ixx="0.3"), "the largest principal inertia (0.3 kg m^2) exceeds the sum of the others, 0.2"),
         (inertial(izz="-0.1"), "principal inertias (-0.1, 0.1, 0.1 kg m^2) must be positive"),
         (inertial(ixy="0.2"), "must be positive"),
         (inertial(mass="0"), "the mass is 0, but the inertia is not"),

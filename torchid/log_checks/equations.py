@@ -663,7 +663,7 @@ def _named(
 def _are_apart_from_1(gain: FloatArray, reverse: FloatArray) -> BoolArray:
     """Which gains differ from 1: the true gain is between the two regressions, which must be close to each other.
 
-    On the same side of 1, the farther gain may be the third power of the nearer one: torques mostly from armature, which
+    On the same side of 1, the farther gain may be the third power of the nearer one: torques from armature, which
     URDFs rarely state, have 0.13 and 0.75. Negative gains may differ by `FACTOR_TOLERANCE_RATIO` squared.
     """
     logs = np.log(np.maximum(np.abs([gain, reverse]), 1e-12))

@@ -715,7 +715,7 @@ def read_bag(
     messages = _read(files, channels, list(roles.values()), progress)
     series = {role: _series(topic, messages[str(topic.topic)]) for role, topic in roles.items()}
     if unstamped := dict.fromkeys(x.topic for x in series.values() if not x.stamped):
-        problem = "the messages have no stamps; the log uses times of receipt, which are late and uneven"
+        problem = "no stamps in the messages; the log uses times of receipt, which are late and uneven"
         warn_about_file(f"{', '.join(unstamped)}: {problem}")
     recording = _Recording(topics, series, messages)
     return {"time": recording.time} | recording.motion() | recording.contacts() | recording.limb_sensors()

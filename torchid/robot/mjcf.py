@@ -65,6 +65,8 @@ class MjcfModel:
                 meshes, dropped = self._drop_files()
                 self.model = self.spec.compile()
         except ValueError as error:
+            if isinstance(error, InputError):
+                raise
             text = excerpt(" ".join(str(error).split()), 300)
             raise UrdfError(path, "MJCF", f"MuJoCo refuses it: {text}", "a model that MuJoCo loads") from error
         self.meshes = {geom.id: mesh for geom, mesh in meshes}
