@@ -254,9 +254,7 @@ def test_contacts_without_a_wrench_say_themselves_when_they_touch(tmp_path: Path
 
 def test_wrenches_in_a_frame_of_another_name_are_warned_of_unless_that_is_meant(tmp_path: Path) -> None:
     entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, np.ones(6), "/sensor")) for s in map(int, STAMPS)]
-    with pytest.warns(
-        TorchidWarning, match=r"/w: frame '/sensor' is taken for 'sole'; set logs.topics.contact_wrenches"
-    ):
+    with pytest.warns(TorchidWarning, match=r"/w: frame '/sensor' is taken for 'sole'; set logs.topics.contact_wr"):
         read_messages(tmp_path / "x.mcap", entries, contact_wrenches={"sole": "/w"}, contact_force_threshold=1.0)
     meant = {"sole": {"topic": "/w", "frame": "sensor"}}
     read_messages(tmp_path / "x.mcap", entries, contact_wrenches=meant, contact_force_threshold=1.0)

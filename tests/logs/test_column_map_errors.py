@@ -134,7 +134,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     (
         POSITION + "contact_active: {above: 3}",
         {},
-        "contact_active.above: nothing to compare with it; accepted: a column",
+        "contact_active.above: nothing to compare with it; accepted: a ",
     ),
     (
         POSITION + "contact_active: {above: 3, always: [a]}",

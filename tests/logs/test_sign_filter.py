@@ -55,7 +55,7 @@ def test_friction_reverses_as_often_as_the_joint_and_not_as_its_filtered_velocit
     timeline = timeline_of(log)
     assert timeline.low_pass is not None
     true = timeline.low_pass(np.sign(velocity))[timeline.kept]
-    with pytest.warns(TorchidWarning, match=r"joints move faster .* [34]\d % .*\.cutoff_hz of (40|80|160) or more"):
+    with pytest.warns(TorchidWarning, match=r"the filter removes [34]\d % .*\.cutoff_hz to (40|80|160) or more"):
         found = preprocess(log, CUTOFF).joint_direction
     alone = move_to_timeline(log, timeline, {}).joint_direction  # of velocities behind the timeline's own filter
     assert found is not None

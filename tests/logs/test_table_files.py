@@ -126,7 +126,7 @@ def test_angles_of_opensim_have_the_unit_that_the_map_states(tmp_path: Path, suf
     log = read_log(path, columns=columns)
     np.testing.assert_allclose(log.joint_position, np.column_stack([np.radians(ANGLES), SLIDE]), rtol=1e-15)
     with pytest.raises(
-        LogError, match="joint_position.unit: missing for hip, in a file with inDegrees=yes; accepted: deg"
+        LogError, match="joint_position.unit: missing for hip, in a file with inDegrees=yes; accepted: d"
     ):
         read_log(path, columns=Columns(joint_position=JOINTS))  # type: ignore[arg-type]
     plain = read_log(opensim(path, "no"), columns=Columns(joint_position=JOINTS))  # type: ignore[arg-type]

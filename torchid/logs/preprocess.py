@@ -92,7 +92,7 @@ def preprocess(
 
     Warns:
         TorchidWarning: a torque or wrench channel is NaN in some samples, time stamps nearly coincide, joints move
-            faster than the filter lets through, or accelerations are noise to a large part.
+            faster than the filter lets through, or accelerations are largely noise.
     """
     with about_file(log.source):
         dry = sign_width, stribeck, finds_rest
