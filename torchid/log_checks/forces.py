@@ -346,7 +346,7 @@ def _usual_mistake(filtered: FilteredLog, equations: ForceEquations, derived: tu
         return None
     left, best = trials[0]
     ratio = unexplained / max(left, 1e-9)
-    text = f"{best.description}: unexplained forces are {ratio:.2g} times as large as after correction"
+    text = f"{best.description}: correcting this makes unexplained forces {ratio:.2g} times smaller"
     for other_left, other in trials[1:]:
         if other_left < _ALIKE_RATIO * left and other.description != best.description:
             text += f". As likely: {other.field} {other.description}"

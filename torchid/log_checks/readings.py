@@ -195,7 +195,9 @@ def _gap_finding(steps: FloatArray, median: float, long: BoolArray) -> Finding:
     if steps[longest] > LONGEST_STEP * median:
         advice = f"split the log after sample {longest}: gaps above {LONGEST_STEP:g} steps are not interpolated"
         return Finding("gap", REJECTED, "time", text, advice)
-    advice = f"keep preprocessing.cutoff_hz well below {0.5 / steps[longest]:.3g}, where half a period fits in the gap"
+    advice = (
+        f"keep preprocessing.cutoff_hz well below {0.5 / steps[longest]:.3g} Hz: half a period then fits in the gap"
+    )
     return Finding("gap", SUSPICIOUS, "time", text, advice, spans=tuple(Span(int(i), int(i) + 1) for i in numbers))
 
 

@@ -119,7 +119,7 @@ def best_explanation(filtered: FilteredLog, derived: tuple[str, ...] = ()) -> Ex
     first, *more = best.findings
     also = "".join(f". As likely: {text}" for text in others)
     ratio = equations.unexplained / max(best.left, 1e-9)
-    found_text = f"{first.found}{also}; unexplained forces are {ratio:.2g} times as large as after correction"
+    found_text = f"{first.found}{also}; correcting this makes unexplained forces {ratio:.2g} times smaller"
     return replace(best, findings=[replace(first, found=found_text), *more])
 
 
