@@ -515,10 +515,10 @@ def _low_state_stamps(topic: LowStateTopic, ticks: Stamps, received: Stamps) -> 
     off = np.abs(late - usual)
     if topic.stamps is None and off.max() > _MAX_TICK_ERROR_NS + _MAX_TICK_ERROR_SHARE * np.ptp(received):
         reason = (
-            f"ticks that advance by {np.ptp(elapsed) / 1e9:.4g} s while messages come for "
-            f"{np.ptp(received) / 1e9:.4g} s, and are off by up to {off.max() / 1e9:.3g} s"
+            f"ticks advance by {np.ptp(elapsed) / 1e9:.4g} s, but messages arrive over "
+            f"{np.ptp(received) / 1e9:.4g} s; the largest difference is {off.max() / 1e9:.3g} s"
         )
-        accepted = f"ticks of 1 ms, or {_LOW_STATE}.stamps: receipt, or tick where these are right"
+        accepted = f"ticks of 1 ms, or {_LOW_STATE}.stamps: receipt (or tick, to use them)"
         raise LogError.at_field(topic.topic, reason, accepted)
     return np.asarray(received[:1] + usual + elapsed, dtype=np.int64), True
 
