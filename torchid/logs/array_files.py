@@ -28,7 +28,7 @@ _NO_NUMBERS = np.array(None, dtype=object)
 
 @contextlib.contextmanager
 def serve_arrays(path: Path) -> Iterator[ServedArrays]:
-    """Open a file in the process that reads it; any exception where it is damaged."""
+    """Open a file in the process that reads it; a damaged file raises any exception."""
     suffix = path.suffix.lower()
     with contextlib.ExitStack() as stack:
         if suffix == ".mat" and _is_older_matlab(path):
@@ -43,7 +43,7 @@ def serve_arrays(path: Path) -> Iterator[ServedArrays]:
 
 
 class ServedArrays:
-    """Named arrays of a file that was read whole; of other files what differs."""
+    """Named arrays of a file that was read whole; base class for other files."""
 
     def __init__(self, arrays: Iterable[tuple[str, AnyArray]] = ()) -> None:
         """Take the arrays; ValueError where they are too many."""
@@ -65,7 +65,7 @@ class ServedArrays:
         return tuple(array.shape)
 
     def rows(self, name: str, start: int, stop: int, axis: int) -> AnyArray:
-        """Rows of an array whose shape was asked for, or columns for the axis 1."""
+        """Rows of an array after `shape`, or columns for axis 1."""
         array = self._sliced[name]
         return np.asarray(array[:, start:stop] if axis else array[start:stop])
 
@@ -170,7 +170,7 @@ _OF_MATLAB = ("#refs#", "#subsystem#")  # what cells and objects of its files re
 
 
 def import_h5py(path: Path) -> Any:
-    """The module h5py; LogError where it is not installed."""
+    """The module h5py; LogError if it is not installed."""
     try:
         import h5py
     except ImportError as error:
@@ -248,7 +248,7 @@ class _Hdf5(ServedArrays):
 
 
 def save_hdf5(path: Path, named: Path, arrays: Mapping[str, AnyArray]) -> None:
-    """Write arrays to a new file; `named`: what messages call it.
+    """Write arrays to a new file; `named`: its name in messages.
 
     Raises:
         OSError: the disk is full. The room is taken up first: the HDF5 library crashes where a disk fills up.

@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and 2: messages of topics as arrays with stamps, and these as the fields of a log at common stamps.
+"""Bags of ROS 1 and 2: read messages as arrays with stamps, and align them as the fields of a log.
 
 Another process reads the files; messages are decoded here, by definitions of ROS and Unitree.
 """
@@ -256,7 +256,7 @@ class _Messages:
             raise LogError.at_field(self.topic, reason, f"one {name}")
 
     def parts(self, layout: tuple[tuple[str, ...], tuple[int, ...]]) -> _Parts:
-        """The messages of one layout."""
+        """The messages with one layout of arrays."""
         rows = self.rows[layout]
         values = np.array(rows.values, dtype=np.float64).reshape(len(rows.stamps), -1)
         split = np.split(values, np.cumsum(layout[1])[:-1], axis=1)
@@ -264,7 +264,7 @@ class _Messages:
         return _Parts(stamps, received, dict(zip(_PATHS[self.type], split, strict=True)))
 
     def parts_of_all(self) -> _Parts:
-        """All messages; LogError where there are none, or they have arrays of several lengths."""
+        """All messages; LogError if there are none, or if their arrays differ in length."""
         if not self.rows:
             raise LogError.at_field(self.topic, "no messages", "at least one")
         layout, *others = self.rows

@@ -42,7 +42,7 @@ _BYTES_PER_LETTER = 4  # of a table: a cell has at least two characters, a numbe
 
 
 def log_bytes(path: Path, limit: float) -> int:
-    """Bytes of a log's arrays: an upper bound for tables of text below a limit, 0 for bags, which are read whole.
+    """Bytes of a log's arrays: an upper bound for text tables below a limit, 0 for bags (they are read whole).
 
     A part of a log counts as all of it, several files count together.
 
@@ -64,7 +64,7 @@ def log_bytes(path: Path, limit: float) -> int:
 
 
 def has_blocks(path: Path, columns: Columns | None) -> bool:
-    """Whether a log can be read a block at a time: no bag, nothing interpolated to stamps of others, no episodes."""
+    """Whether a log can be read in blocks: no bag, no episodes, and no interpolation to other stamps."""
     is_joined = existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED)
     return not is_joined and not (columns is not None and (columns.other_times or columns.episodes))
 
@@ -98,7 +98,7 @@ class LogBlocks:
         return 8 + sum(8 * math.prod(shape) for shape in self.row_shapes.values())
 
     def read(self, samples: slice, allow_gaps: bool = False, bridge_gaps_s: float | None = None) -> Log:
-        """Some samples as a log; `allow_gaps` and `bridge_gaps_s` as of `read_log`. Raises LogError: invalid values."""
+        """Some samples as a log; `allow_gaps` and `bridge_gaps_s` as in `read_log`. Raises LogError: invalid values."""
         raw = self.read_rows(slice(self.first + samples.start, self.first + samples.stop))
         raw["time"] = self.time[samples]
         return build_log(bridge_gaps(about_world_origin(raw), bridge_gaps_s), allow_gaps)
@@ -108,7 +108,7 @@ class LogBlocks:
 def open_log_blocks(
     path: Path, folder: Path, columns: Columns | None = None, needs_flags: bool = True
 ) -> Iterator[LogBlocks]:
-    """Open a log in one file (.h5, .npz or a table), from which rows are read as any file in memory is.
+    """Open a log in one file (.h5, .npz or a table) to read it in blocks.
 
     Arrays of .h5 and .npz files are read in place unless these are compressed; others, and tables, are unpacked to
     temporary files in `folder`. Of a part of a log no other samples are there.

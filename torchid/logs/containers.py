@@ -50,7 +50,7 @@ class LogKind(Enum):
 
 
 def existing_log_kind(path: Path, beside: Path | None = None) -> LogKind:
-    """The kind of an existing log, or of the file that it is a part of.
+    """The kind of an existing log, or of the file of a part.
 
     Args:
         path: the log.
@@ -92,7 +92,7 @@ def list_bag_files(path: Path) -> list[Path]:
 
 
 def log_files(path: Path) -> list[Path]:
-    """The files of a log, or of the one that it is a part of: several of a bag in a folder, or of joined files."""
+    """The files of a log or of a part of one: several for a bag in a folder, or for joined files."""
     files = (file.path for file in split_range(path).files)
     return [part for file in files for part in list_bag_files(file) or [file]]
 
@@ -119,7 +119,7 @@ _MAX_QUOTED = 200
 
 @contextlib.contextmanager
 def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
-    """Turn all exceptions of readers on a damaged file into a LogError."""
+    """Turn every exception of a reader into a LogError."""
     try:
         yield
     except (TorchidError, Warning):
@@ -148,18 +148,18 @@ class Container:
         return array
 
     def shape(self, name: str, folder: Path) -> tuple[int, ...]:
-        """Shape of an array of which `rows` are read; what is packed is unpacked to a file in the folder first."""
+        """Shape of an array, before `rows`; a compressed array is first unpacked to a file in the folder."""
         return tuple(self._opened.call("shape", name, os.fspath(folder.absolute())))
 
     def rows(self, name: str, rows: slice, axis: int = 0) -> NDArray[Any]:
-        """Rows of an array whose shape was asked for, or columns for the axis 1."""
+        """Rows of an array after `shape`, or columns for axis 1."""
         array: NDArray[Any] = self._opened.call("rows", name, rows.start, rows.stop, axis)
         return array
 
 
 @contextlib.contextmanager
 def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
-    """Open a .npz, .h5, .hdf5, .mat or .json file; LogError where it is missing, of another kind, damaged or too large.
+    """Open a .npz, .h5, .hdf5, .mat or .json file; LogError if it is missing, unknown, damaged or too large.
 
     Args:
         path: the file.
@@ -186,14 +186,14 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
 
 @contextlib.contextmanager
 def open_npz(path: Path) -> Iterator[Container]:
-    """Open a file by its extension, a .npz archive of any other; any exception where it is damaged or is none."""
+    """Open a file by its extension, by default as a .npz archive; a damaged file raises any exception."""
     with open_apart(serve_arrays, path) as opened:
         yield Container(opened)
 
 
 @contextlib.contextmanager
 def atomic_output(path: Path) -> Iterator[Path]:
-    """A temporary file that is renamed to `path` at the end of the block, unless an error occurs.
+    """A temporary file; it is renamed to `path` at the end of the block, unless an error occurs.
 
     Raises:
         LogError: the file cannot be written.
@@ -206,7 +206,7 @@ def atomic_output(path: Path) -> Iterator[Path]:
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays to a .npz, .h5 or .hdf5 file, which appears complete or not at all."""
+    """Write arrays to a .npz, .h5 or .hdf5 file: completely or not at all."""
     suffix = _suffix(path, ARRAYS)
     with atomic_output(path) as temporary:
         if suffix == ".npz":

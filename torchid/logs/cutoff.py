@@ -59,7 +59,7 @@ _OF_WEIGHT = ("base_linear_velocity_world", "base_position_world")
 
 @dataclass(frozen=True)
 class CutoffChoice:
-    """A cutoff, and what it was chosen by.
+    """A cutoff, and the reason for it.
 
     Attributes:
         cutoff_hz: [Hz]; None: nothing is derived, and nothing filtered.
@@ -84,7 +84,7 @@ class CutoffChoice:
 
 
 def usual_cutoff_hz(sample_rate_hz: float) -> float:
-    """The cutoff [Hz] where neither the user nor noise says another."""
+    """The default cutoff [Hz]."""
     return min(_USUAL_HZ, _RATE_SHARE * sample_rate_hz)
 
 
@@ -94,7 +94,7 @@ def choose_cutoff(
     sample_rate_hz: float | None = None,
     base_is_derived: bool = False,
 ) -> CutoffChoice:
-    """One cutoff for logs, such that forces of the filtered motion are nearly the filtered forces.
+    """Choose one cutoff for all logs: forces of the filtered motion must nearly equal the filtered forces.
 
     Motion and forces pass the same filter, so that motion beyond its cutoff is no error of equations that are linear in
     it. Gravity and Coriolis terms are not: of wide angles they have harmonics, which a filter takes off the forces and

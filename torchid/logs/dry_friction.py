@@ -1,4 +1,4 @@
-"""What dry friction goes with at the stamps of a preprocessed log: directions of joints, and where they rest.
+"""Directions of joints for dry friction at the stamps of a preprocessed log, and joints at rest.
 
 A low-pass filter for accelerations takes vibration off the velocities, and with it their reversals: the mean of the
 sign comes out too large. The sign needs no derivative, so that it bears more of the noise: its filter is as wide as the
@@ -28,12 +28,12 @@ _ROUNDING = 1e-9  # share of a weight
 
 
 def channels_together(count: int) -> int:
-    """How many channels of so many samples are filtered by one call."""
+    """How many channels of this many samples are filtered in one call."""
     return max(1, _VALUES_TOGETHER // max(count, 1))
 
 
 def dry_friction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline) -> dict[str, Any]:
-    """`joint_direction` and, with a Stribeck velocity, `joint_stribeck`, (K, n), none where nothing is filtered.
+    """`joint_direction` and, with a Stribeck velocity, `joint_stribeck`, (K, n); none without a filter.
 
     The filter smears its torque as all others; velocities with reversals that it would take off are filtered less.
     Where joints at rest are to be found, `joint_rests` too.
@@ -125,7 +125,7 @@ _EVIDENT = 0.01  # share of the velocities' power by which the error must fall: 
 
 
 def with_sign_filter(timeline: Timeline, log: Log, noise: SignalNoise) -> Timeline:
-    """A timeline of a log with the filter of `wider_low_pass` and the noise behind it.
+    """A timeline of a log with the filter of `wider_low_pass` and the noise after it.
 
     Where joints at rest are to be found, with the velocity that they have at most: a tenth of the root mean square, as
     in `resting_share`, or three standard deviations of noise.
@@ -173,13 +173,13 @@ def with_sign_filter(timeline: Timeline, log: Log, noise: SignalNoise) -> Timeli
 
 
 def with_signs_of(timeline: Timeline, whole: Timeline) -> Timeline:
-    """The timeline of a segment with what `with_sign_filter` has found of the whole log."""
+    """The timeline of a segment with the results of `with_sign_filter` for the whole log."""
     of_log = {name: getattr(whole, name) for name in ("sign_low_pass", "sign_noise", "rest_speed")}
     return replace(timeline, **of_log)
 
 
 def resting_share(velocity: FloatArray, noise: FloatArray | float = 0.0) -> FloatArray:
-    """Share of the time, (n,), in which joints move slower than a tenth of their velocity's root mean square.
+    """Share of the time, (n,), in which joints are slower than a tenth of their rms velocity.
 
     Args:
         velocity: (N, n) [rad/s or m/s].
@@ -191,7 +191,7 @@ def resting_share(velocity: FloatArray, noise: FloatArray | float = 0.0) -> Floa
 
 @dataclass(frozen=True)
 class WiderLowPass:
-    """A filter that leaves velocities a smaller error than that of a timeline.
+    """A filter with a smaller velocity error than that of a timeline.
 
     Attributes:
         low_pass: the filter.
@@ -210,7 +210,7 @@ class WiderLowPass:
 
 
 def wider_low_pass(log: Log, timeline: Timeline) -> WiderLowPass | None:
-    """The filter of velocities that leaves their least error, of motion that is lost and noise that is left together.
+    """The filter with the smallest velocity error: lost motion plus remaining noise.
 
     None for that of the timeline, unless a wider one is clearly better.
 
@@ -260,14 +260,14 @@ def _error(low_pass: LowPass, values: FloatArray, correlation: FloatArray) -> fl
 
 
 def mean_sign(velocity: FloatArray) -> FloatArray:
-    """Mean of the sign of what goes from each value to the next, (M, ...) of (M + 1, ...)."""
+    """Mean sign along straight lines from each value to the next, (M, ...) from (M + 1, ...)."""
     size = np.abs(velocity)
     total = size[:-1] + size[1:]
     return np.divide(velocity[:-1] + velocity[1:], total, out=np.zeros_like(total), where=total > 0.0)
 
 
 def mean_tanh(velocity: FloatArray) -> FloatArray:
-    """Likewise of the hyperbolic tangent, whose integral is log cosh."""
+    """Likewise for the hyperbolic tangent; its integral is log cosh."""
     size = np.abs(velocity)
     integral = np.diff(size + np.log1p(np.exp(-2.0 * size)), axis=0)
     change = np.diff(velocity, axis=0)
@@ -276,7 +276,7 @@ def mean_tanh(velocity: FloatArray) -> FloatArray:
 
 
 def noisy_width(timeline: Timeline, columns: slice) -> float | FloatArray | None:
-    """Width over which the sign of some joints' velocities reverses on average where noisy ones pass through 0.
+    """Width over which the mean sign of noisy joint velocities reverses around 0.
 
     None for at once: a timeline without a width and without noise.
 
@@ -293,7 +293,7 @@ def noisy_width(timeline: Timeline, columns: slice) -> float | FloatArray | None
 
 
 def mean_dry(velocity: FloatArray, width: float | FloatArray | None) -> FloatArray:
-    """Mean of the sign as Coulomb friction has it: over a width [rad/s or m/s], None for at once."""
+    """Mean sign for Coulomb friction, smoothed over a width [rad/s or m/s]; None for a sharp sign."""
     return mean_sign(velocity) if width is None else mean_tanh(velocity / width)
 
 

@@ -1,4 +1,4 @@
-"""Recordings side by side in a file of arrays, one after the other: stacked along an axis, or in a group for each."""
+"""Several recordings in one file of arrays, stacked along an axis or in groups, read one after the other."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ AnyArray = NDArray[Any]
 
 
 class EpisodeArrays:
-    """Arrays of a file as a map of its columns has them, one recording after the other where it says so.
+    """Arrays of a file for a map of its columns; recordings follow one another if the map has episodes.
 
     Attributes:
         names: of the arrays.
@@ -73,7 +73,7 @@ class EpisodeArrays:
         self._lengths = lengths.astype(np.int64).tolist()
 
     def load(self, name: str) -> AnyArray:
-        """An array with a row for each sample of all episodes; LogError for groups whose arrays differ in shape."""
+        """An array with a row for each sample of all episodes; LogError if arrays of groups differ in shape."""
         if name in self._groups:
             return self._grouped(self._groups[name])
         array = self._load(name)
@@ -103,7 +103,7 @@ class EpisodeArrays:
         return np.concatenate(parts)
 
     def stamps(self, time: AnyArray, rows: int, has_step: bool) -> AnyArray:
-        """Stamps of all samples, of those that were read; `has_step`: or counted, of so many rows throughout."""
+        """Stamps of all samples, from the stamps of the file; `has_step`: from counted stamps of this many rows."""
         counts = self._lengths or self._counts.get(rows, [rows])
         if has_step and len(counts) > 1:
             return np.concatenate([time[:count] for count in counts])
@@ -114,12 +114,12 @@ class EpisodeArrays:
 
 
 def in_groups(pattern: str) -> re.Pattern[str]:
-    """What matches names within the groups that a pattern such as `data/demo_*` means: their number, and the rest."""
+    """Regular expression for names in the groups of a pattern such as `data/demo_*`: number, and rest of the name."""
     return re.compile(re.escape(pattern.rstrip("/")).replace(r"\*", r"(\d+)") + "/(.+)")
 
 
 def groups_of(names: Collection[str], pattern: str) -> dict[str, list[str]]:
-    """Names of the groups of a file that a pattern such as `data/demo_*` means, by number, by what all have in them."""
+    """Names in the groups of a pattern such as `data/demo_*`, by number, by their common part."""
     numbered = dict[str, dict[int, str]]()
     for name in names:
         if (match := in_groups(pattern).fullmatch(name)) is not None:

@@ -1,4 +1,4 @@
-"""Which contacts stand when, by thresholds with hysteresis of what they carry."""
+"""Contact flags from thresholds of the contact forces, with hysteresis."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _KEY = "preprocessing.contact_threshold"
 
 @dataclass(config=STRICT, frozen=True)
 class ContactThreshold:
-    """When a contact stands by its force: from where that exceeds `above` [N] until it is below `below` [N].
+    """A contact is active from a force above `above` [N] until a force below `below` [N].
 
     Without `below` both are the same. Stances and swings shorter than `shortest_s` [s] are none.
     """
@@ -27,7 +27,7 @@ class ContactThreshold:
 
 
 def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, BoolArray]:
-    """The log with flags by what its contacts carry in the place of what it has, and where they are certain.
+    """The log with flags from its contact forces instead of its own, and a mask of samples with certain flags.
 
     A contact without a force keeps its recorded flag. Samples (N,) of stances that are too short to count are not
     certain.
@@ -87,12 +87,12 @@ def _force_sizes(log: Log) -> FloatArray:
 
 
 def samples_of(seconds: float, time: FloatArray) -> int:
-    """How many median steps of stamps (N,) [s] a duration [s] is."""
+    """A duration [s] in median steps of stamps (N,) [s]."""
     return round(seconds / float(np.median(np.diff(time)))) if len(time) > 1 else 0
 
 
 def hysteresis(values: FloatArray, on: float, off: float) -> BoolArray:
-    """Which values (N,) are above `on`, or have been since and are not below `off`."""
+    """Mask (N,): set from a value above `on` until a value below `off`."""
     state = np.where(values > on, 1, np.where(values < off, 0, -1))
     known = np.flatnonzero(state >= 0)
     if not len(known):
@@ -102,7 +102,7 @@ def hysteresis(values: FloatArray, on: float, off: float) -> BoolArray:
 
 
 def without_short(flags: BoolArray, shortest: int) -> BoolArray:
-    """The flags (N,) without runs of fewer samples, the shortest first, but for those at the ends."""
+    """The flags (N,) without runs of fewer samples, the shortest first; runs at the ends stay."""
     out = flags.copy()
     while True:
         ends = np.flatnonzero(out[1:] != out[:-1]) + 1

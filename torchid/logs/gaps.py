@@ -35,7 +35,7 @@ _SLACK = 1e-6
 
 
 def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dict[str, NDArray[Any]]:
-    """The fields of a file without their short gaps: NaN between two values that are not further apart than a length.
+    """Fill short gaps in the fields of a file: NaN between two values at most this far apart.
 
     A cubic spline through the channel's other samples fills them: it passes 2 times the noise of the samples in the
     middle of a gap of five steps, a quintic one 5 times. Quaternions are filled as a whole and normalised, contact
@@ -194,7 +194,7 @@ def require_no_turns(log: Log) -> None:
 
 @dataclass(frozen=True)
 class Coverage:
-    """Which channels of a field were measured throughout.
+    """Which channels of a field were measured in all samples.
 
     Attributes:
         missing: samples (N, ...) in which there is something to measure (all, or those in contact) and no value.
@@ -208,7 +208,7 @@ class Coverage:
 
 
 def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
-    """Warn of channels that become NaN throughout because they are NaN in some samples.
+    """Warn about channels that become NaN in all samples because they are NaN in some.
 
     Warns:
         TorchidWarning: names them.

@@ -103,7 +103,7 @@ class SignalNoise:
 
     @property
     def found(self) -> bool:
-        """Whether there is any."""
+        """Whether any noise was found."""
         return any(bool(x.any()) for x in self.std.values())
 
 
@@ -240,7 +240,7 @@ class Log:
 
     @property
     def contact_wrench(self) -> FloatArray | None:
-        """Contact wrenches (N, C, 6) [N, N m] along whichever axes they were given; None if they were not."""
+        """Contact wrenches (N, C, 6) [N, N m] along their recorded axes; None if not recorded."""
         return self.contact_wrench_local if self.contact_wrench_world is None else self.contact_wrench_world
 
     def arrays(self) -> dict[str, FloatArray | BoolArray]:
@@ -379,7 +379,7 @@ def normalize_quaternions(name: str, quat: FloatArray, allow_nan: bool = False) 
 
 
 def normalize_normals(normals: FloatArray, active: BoolArray, labels: tuple[str, ...]) -> FloatArray:
-    """Normals (N, C, 3) with a norm of exactly one, NaN where they are not known in the air.
+    """Normals (N, C, 3) with a norm of exactly one; NaN for unknown normals in the air.
 
     LogError at the first active contact, (N, C) bool, whose normal has another norm.
     """

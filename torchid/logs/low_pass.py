@@ -30,7 +30,7 @@ _FILTERED_AT_ONCE = 2**16
 
 @cache
 def import_signal() -> ModuleType:
-    """`scipy.signal`: it takes 0.1 s, which runs that neither filter nor draw need not."""
+    """`scipy.signal`, imported late: it takes 0.1 s, and some runs need no filter."""
     from scipy import signal
 
     return signal
@@ -69,7 +69,7 @@ class LowPass:
 
     @cached_property
     def impulse_response(self) -> FloatArray:
-        """What is left of a sample of 1, before, at and after it, (M,) with that sample in the middle."""
+        """Response of the filter to a single sample of 1, (M,), with that sample in the middle."""
         reach = self.settling + self.padding
         impulse = np.zeros(2 * reach + 1)
         impulse[reach] = 1.0
@@ -81,7 +81,7 @@ class LowPass:
         return _noise_share(self.sections.tobytes())
 
     def gain(self, cycles: FloatArray) -> FloatArray:
-        """By how much amplitudes change at frequencies (K,) [1/samples], in both passes together."""
+        """Gain of amplitudes at frequencies (K,) [1/samples], for both passes together."""
         _, response = import_signal().sosfreqz(self.sections, worN=2.0 * np.pi * cycles)
         return np.asarray(np.square(np.abs(response)))
 

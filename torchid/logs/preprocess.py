@@ -125,7 +125,7 @@ def make_timeline(
 
 
 def measured_coverage(log: Log, timeline: Timeline) -> dict[str, Coverage]:
-    """Coverage of fields that are filtered or resampled, whose channels must then have no gap; warns of gaps."""
+    """Coverage of fields that are filtered or resampled (their channels must have no gap); warns of gaps."""
     if timeline.low_pass is None and timeline.output is None:
         return {}
     coverage = {name: measure_coverage(log, name) for name in NAN_ALLOWED if getattr(log, name) is not None}
@@ -189,7 +189,7 @@ def _motion(log: Log, timeline: Timeline) -> dict[str, FloatArray]:
     """Quantities of motion at the output's stamps: the recorded ones, and derivatives for missing ones."""
 
     def underived(names: tuple[str, ...]) -> tuple[str, ...]:
-        """A quantity with those of its derivatives that nothing else gives."""
+        """A quantity with its derivatives that no other field gives."""
         return names[:1] + tuple(takewhile(lambda name: getattr(log, name) is None, names[1:]))
 
     given = [chain[i:] for chain in DERIVATIVE_CHAINS for i in range(len(chain)) if getattr(log, chain[i]) is not None]
@@ -274,7 +274,7 @@ UNLOADED_MARGIN_S = 0.05
 
 
 def near_contact_changes(log: Log, time: FloatArray, margin: float) -> BoolArray:
-    """Which of some stamps lie within a margin of a change of contact.
+    """Which stamps lie within a margin of a change of contact.
 
     Args:
         log: as recorded; a change lies between two of its samples.
@@ -319,7 +319,7 @@ def away_from_stamps(time: FloatArray, stamps: FloatArray, margin: float) -> Boo
 
 
 def unloaded_readings(log: Log, where: BoolArray | None = None) -> FloatArray | None:
-    """What the sensors of contacts read while nothing touches, (N, C, 6), NaN elsewhere; None if there is none.
+    """Readings of contact sensors without contact, (N, C, 6), NaN elsewhere; None if there are none.
 
     The force along the normal is a seventh component where a log has it.
 

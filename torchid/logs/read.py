@@ -110,7 +110,7 @@ def read_log(
 
 @contextmanager
 def files_of_recordings_kept() -> Iterator[None]:
-    """Within, a file that successive recordings are parts of (`walk.npz[#0:40]`) is read once: the last one is kept."""
+    """Keep the last file in memory, so that successive recordings of it (`walk.npz[#0:40]`) read it once."""
     token = _last_file.set(_LastFile())
     try:
         yield
@@ -144,7 +144,7 @@ _last_file: ContextVar[_LastFile | None] = ContextVar("last file", default=None)
 def read_recordings(
     path: str | os.PathLike[str], topics: Topics | None = None, columns: Columns | None = None
 ) -> list[Log]:
-    """The recordings of a log, with their gaps: several where stamps begin anew, as of episodes in one file.
+    """The recordings of a log, with their gaps: several if stamps start again, as for episodes in one file.
 
     Args:
         path: as of `read_log`.

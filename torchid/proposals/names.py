@@ -75,7 +75,7 @@ _FIELD_OF = {
 
 
 def words_of(text: str) -> list[str]:
-    """The words of a name in lower case, parted by anything but letters and by capitals: q and joint of `qJoint_1`."""
+    """The words of a name in lower case, split at capitals and other characters: q and joint of `qJoint_1`."""
     return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", text)]
 
 
@@ -89,7 +89,7 @@ def join_pairs(words: Sequence[str]) -> list[str]:
 
 
 def is_measured(words: Sequence[str]) -> bool:
-    """Whether no word of a column says that it holds what a controller wants, or a model gives."""
+    """Whether no word of a column marks it as a command or a model's value."""
     return not _NOT_MEASURED & set(words)
 
 
@@ -125,7 +125,7 @@ def propose_field(column: str) -> str:
 
 @dataclass(frozen=True)
 class RobotNames:
-    """What the proposal of a map knows of a robot.
+    """Names and properties of a robot for the proposal of a map.
 
     Attributes:
         joints: of the robot.
@@ -151,7 +151,7 @@ class RobotNames:
     limb_sensors: Mapping[str, str] = field(default_factory=dict)
 
     def imu_frame(self) -> tuple[str, str]:
-        """The link of the base that is called IMU, else the base link, and why."""
+        """The link of the base that is called IMU, else the base link, and the reason."""
         named = [name for name in self.on_base if "imu" in name.lower()]
         others = [name for name in self.elsewhere if "imu" in name.lower()]
         beyond = f"; {others[0]} is beyond a joint" if others else ""
@@ -162,7 +162,7 @@ class RobotNames:
 
 @dataclass(frozen=True)
 class Spelling:
-    """What a recording calls names of a robot.
+    """The names that a recording uses for the names of a robot.
 
     Attributes:
         names: of the robot, by what stands for each.
@@ -200,7 +200,7 @@ def _common_starts(names: Sequence[str]) -> list[str]:
 
 
 def find_spelling(texts: Sequence[str], names: Sequence[str]) -> Spelling:
-    """That spelling of a robot's names by which most of them are within texts, the exact one first."""
+    """The spelling that finds most of a robot's names in texts; the exact one comes first."""
     best = Spelling()
     for spelling in spellings(names):
         seen = {stem: name for stem, name in spelling.names.items() if any(map(within(stem).search, texts))}
@@ -210,7 +210,7 @@ def find_spelling(texts: Sequence[str], names: Sequence[str]) -> Spelling:
 
 
 def exchange_affixes(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """A robot's names by texts that are exactly these; if none are, that are all of them with another prefix or suffix.
+    """A robot's names by equal texts; if none is equal, by texts that differ only in a prefix or suffix.
 
     `fer_joint1` is `panda_joint1`, `l_knee` is `l_knee_joint`. Texts may be more than names, or at least half of these.
     """
@@ -225,7 +225,7 @@ def exchange_affixes(texts: Sequence[str], names: Sequence[str]) -> dict[str, st
 
 
 def usual_order(kind: str, robot: RobotNames, count: int) -> tuple[list[str] | str, str] | None:
-    """The order that so many numbers of joints or contacts are assumed to have, or the robot whose it is, and why."""
+    """The assumed order of this many numbers of joints or contacts, or the robot that has it, and the reason."""
     names = robot.joints if kind == "joint" else robot.feet
     for maker in suitable_orders(robot.joints, robot.name):
         order = JOINT_ORDERS[maker]

@@ -1,4 +1,4 @@
-"""Some of what a file holds, from which a map is proposed: columns, arrays, episodes of these, messages of topics."""
+"""Samples of a file for the proposal of a map: columns, arrays, episodes, messages of topics."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def stated_names(sample: FileSample, name: str) -> list[str]:
 
 
 def numbers_of(sample: FileSample, columns: Sequence[str]) -> NDArray[np.float64]:
-    """Numbers (N, k) of columns or of an array; all in one column where these have not as many rows."""
+    """Numbers (N, k) of columns or of an array; one single column if these differ in rows."""
     arrays = [np.asarray(x, dtype=float) for column in columns if (x := sample[column]) is not None]
     flat_ones = [x.reshape(len(x), -1) if x.ndim else x.reshape(1, 1) for x in arrays]
     if len({len(x) for x in flat_ones}) == 1:
@@ -66,7 +66,7 @@ def numbers_of(sample: FileSample, columns: Sequence[str]) -> NDArray[np.float64
 
 
 def increases(values: NDArray[Any] | None, strictly: bool = True) -> bool:
-    """Whether numbers (N,) or (N, 1) are stamps: of a clock that goes forwards nearly throughout, if not `strictly`."""
+    """Whether numbers (N,) or (N, 1) are stamps: a clock that goes forwards, always (`strictly`) or nearly always."""
     if (
         values is None
         or values.dtype.kind not in "fiu"
@@ -92,7 +92,7 @@ def slope_fit(position: NDArray[Any], velocity: NDArray[Any]) -> tuple[float, fl
 
 
 def with_samples_first(sample: FileSample) -> tuple[FileSample, str]:
-    """Arrays with a row for each sample, those that were transposed for it by the name `NAME.T`; and a note.
+    """Arrays with a row for each sample, transposed arrays as `NAME.T`; and a note.
 
     Nothing is transposed that has as many rows as there are stamps.
     """

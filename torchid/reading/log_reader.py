@@ -360,7 +360,7 @@ def _with_flags(log: Log, setup: RobotSetup) -> tuple[Log, BoolArray]:
 
 
 def check_read(logs: Mapping[str, Sequence[Samples]]) -> None:
-    """Make sure that no sample has two uses, which of parts of logs no file says, and that something is left to fit.
+    """Check that no sample of a part is used twice, and that some samples remain for the fit.
 
     Args:
         logs: by their key in `logs`.
