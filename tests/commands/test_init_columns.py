@@ -239,7 +239,7 @@ def test_units_in_headers_are_those_of_the_map(tmp_path: Path, time: str, names:
 def test_a_unit_that_nobody_knows_is_to_be_filled_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = save_csv(tmp_path / "x.csv", by_name(recorded(), ("q_{} [gon]", "dq_{}", "tau_{}")))
     said = init(URDF, path, tmp_path / "x.yaml")
-    assert any("unit 'gon' of its columns is no unit of angle or length" in line for line in said.missing)
+    assert any("unit 'gon' of its columns is no angle or length unit" in line for line in said.missing)
     message = refusal(["identify", str(tmp_path / "x.yaml")], tmp_path, capsys)
     assert "logs.columns.joint_position.unit: 'FILL_IN', an unknown unit; accepted: rad, mrad, deg, rev" in message
 

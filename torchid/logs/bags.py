@@ -422,11 +422,7 @@ def _imu_fields(topic: ImuTopic, parts: Mapping[str, FloatArray]) -> dict[str, F
     out = dict(zip(fields, (parts[part] for part in _IMU_PARTS), strict=False))
     for part in _IMU_PARTS[: len(fields)]:
         if (parts[f"{part}_covariance.0"] == -1.0).any():
-            accepted = (
-                "an IMU with linear_acceleration and angular_velocity"
-                if part != "orientation"
-                else f"{_IMU}.orientation: false"
-            )
+            accepted = "an IMU with both readings" if part != "orientation" else f"{_IMU}.orientation: false"
             raise LogError.at_field(topic.topic, f"no {part} (the first of its covariances is -1)", accepted)
     if topic.orientation:
         quat = out["base_quat_xyzw"]

@@ -46,9 +46,7 @@ class EpisodeArrays:
     def _find_groups(self, pattern: str) -> None:
         self._groups = groups_of(self.names, pattern)
         if not self._groups:
-            accepted = (
-                f"a name with * for the number, of groups with the same arrays; an array: {excerpt(self.names[0])}"
-            )
+            accepted = f"a name with * for the number, of groups with equal arrays; one array: {excerpt(self.names[0])}"
             raise LogError.at_field(f"{KEY}.episodes.groups", f"no groups '{excerpt(pattern)}'", accepted)
         regex = in_groups(pattern)
         self.names = [*self._groups, *(x for x in self.names if not regex.fullmatch(x) and x not in self._groups)]

@@ -582,9 +582,7 @@ class _Proposer:
         other = [x for x in family.units if x and not set(quantities) & set(quantities_with(x))]
         if other and quantities:
             entry["unit"] = FILL_IN
-            self.out.assumed[name] = (
-                f"unit '{excerpt(other[0])}' of its columns is no unit of {' or '.join(quantities)}"
-            )
+            self.out.assumed[name] = f"unit '{excerpt(other[0])}' of its columns is no {' or '.join(quantities)} unit"
         elif len(set(family.units)) > 1 and family.kind:
             pairs = zip(family.names, family.units, strict=False)
             entry["unit"] = {joint: unit for joint, unit in pairs if unit}

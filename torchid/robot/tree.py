@@ -152,12 +152,7 @@ def _find_root(path: Path, links: list[Link], joints: list[TreeJoint]) -> str:
             reached.add(child)
             queue.append(child)
     if len(roots) > 1:
-        raise UrdfError(
-            path,
-            "tree",
-            f"several root links: {', '.join(roots[:4])}",
-            "one link without a parent joint",
-        )
+        raise UrdfError(path, "tree", f"several root links: {', '.join(roots[:4])}", "one link without a parent joint")
     if len(reached) < len(links):
         unreached = next(link.name for link in links if link.name not in reached)
         raise UrdfError(path, f"link '{unreached}'", "part of a loop of joints", "a tree without loops")
@@ -180,12 +175,7 @@ def resolve_mimics(path: Path, joints: Sequence[TreeJoint]) -> dict[str, Mimic]:
             multiplier *= master.mimic.multiplier
             master = by_name[master.mimic.joint]
             if master.name in visited:
-                raise UrdfError(
-                    path,
-                    f"joint '{joint.name}', <mimic>",
-                    "mimic joints form a loop",
-                    "a free master",
-                )
+                raise UrdfError(path, f"joint '{joint.name}', <mimic>", "mimic joints form a loop", "a free master")
             visited.add(master.name)
         _check_mimic_size(path, joint.name, multiplier, offset)
         if master.type not in MOVING_TYPES:
