@@ -44,10 +44,10 @@ def stopped(error: BaseException, capsys: pytest.CaptureFixture[str]) -> tuple[i
 @pytest.mark.parametrize(
     ("error", "status", "parts"),
     [
-        (KeyError("x"), 1, ("KeyError: 'x'", "a fault in torchid", "--debug shows where")),
-        (RuntimeError(EVIL), 1, ("RuntimeError", "a fault in torchid")),
-        (RecursionError(), 1, ("RecursionError: no text", "a fault in torchid")),
-        (AssertionError(), 1, ("AssertionError", "a fault in torchid")),
+        (KeyError("x"), 1, ("KeyError: 'x'", "a bug in torchid", "the output of --debug")),
+        (RuntimeError(EVIL), 1, ("RuntimeError", "a bug in torchid")),
+        (RecursionError(), 1, ("RecursionError: no text", "a bug in torchid")),
+        (AssertionError(), 1, ("AssertionError", "a bug in torchid")),
         (MemoryError(), 1, ("not enough memory", "accepted: smaller logs")),
         (OSError(errno.ENOSPC, "No space left on device"), 1, ("OSError: [Errno 28] No space left on device",)),
     ],
@@ -62,7 +62,7 @@ def test_any_error_becomes_a_line_that_says_what_was_being_done(
     assert "outer.yaml" not in line
     for part in parts:
         assert part in line
-    assert ("fault in torchid" in line) == any("fault" in part for part in parts)
+    assert ("bug in torchid" in line) == any("bug" in part for part in parts)
 
 
 def test_arguments_that_are_not_understood_are_repeated_in_plain_text(capsys: pytest.CaptureFixture[str]) -> None:

@@ -130,7 +130,7 @@ def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["init", str(URDF), str(log), "--output", str(tmp_path / "new.yaml")]) == 0
     shown = capsys.readouterr().out
     for text in (
-        "missing       time: to be filled in, between samples",
+        "missing       time: to be filled in, the step between samples",
         "missing       joint_position: to be filled in, a column or pattern below",
         "missing       joint_torque: to be filled in, torques [N m]",
         "missing       motion of the base: neither its pose nor an IMU",

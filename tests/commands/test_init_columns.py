@@ -285,8 +285,8 @@ def test_a_joint_with_a_torque_but_without_a_position_is_said(tmp_path: Path) ->
 
 
 UNKNOWN = {
-    "positions": ("out_{}", "dq_{}", "tau_{}", "joint_position: FILL_IN, which is to be filled in; accepted: a name"),
-    "torques": ("q_{}", "dq_{}", "out_{}", "joint_torque: FILL_IN, which is to be filled in; accepted: a name"),
+    "positions": ("out_{}", "dq_{}", "tau_{}", "joint_position: still FILL_IN; accepted: the name"),
+    "torques": ("q_{}", "dq_{}", "out_{}", "joint_torque: still FILL_IN; accepted: the name"),
 }
 
 
@@ -342,7 +342,10 @@ def test_without_stamps_the_step_is_that_by_which_velocities_are_slopes(
     found, said, text = initiated(save_csv(tmp_path / "x.csv", columns))
     assert map_in(text)["time"] == {"step": 10.0, "unit": "ms"}
     np.testing.assert_allclose(found.time, log.time - log.time[0], atol=1e-9)
-    assert any(line.startswith("time: by the slopes of positions") for line in said.assumed)
+    assert any(
+        line.startswith("time: the log has no stamps; with this step velocities are the slopes of positions")
+        for line in said.assumed
+    )
     columns = {name: x for name, x in columns.items() if not name.startswith("dq")}
     init(URDF, save_csv(tmp_path / "y.csv", columns), tmp_path / "y.yaml")
     message = refusal(["identify", str(tmp_path / "y.yaml")], tmp_path, capsys)
@@ -357,7 +360,7 @@ def test_columns_without_names_are_known_by_their_place_and_slopes(
     columns = {str(k): x for k, x in enumerate(by_name(log).values())}
     path = save_csv(tmp_path / "x.csv", columns)
     path.write_text(path.read_text() if counted else path.read_text().partition("\n")[2])
-    assert "37 of numbers without a line of names" in refusal(["check", str(path)], tmp_path, capsys)
+    assert "columns: 37 columns of numbers without a line of names" in refusal(["check", str(path)], tmp_path, capsys)
     init(URDF, path, tmp_path / "x.yaml")
     text = (tmp_path / "x.yaml").read_text()
     assert map_in(text)["time"] == "column_0"

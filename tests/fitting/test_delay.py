@@ -113,7 +113,7 @@ def test_a_delay_reaches_across_no_break_of_a_log_and_knows_nothing_beside_what_
     known = np.isfinite(lacking.joint_torque)
     assert (~known).sum() == 2
     assert known[:, 1].all()
-    with pytest.raises(LogError, match="not longer than actuators.delay \(9 s\)"):
+    with pytest.raises(LogError, match=r"not longer than actuators.delay \(9 s\)"):
         with_delayed_torques(log, 9.0)
 
 

@@ -171,7 +171,7 @@ def test_ticks_that_are_no_milliseconds_are_refused_unless_meant(tmp_path: Path)
     log = moving(GO2, 1000)
     counted = {"ticks": 1000 + np.arange(1000)}  # of messages, each 2 ms
     message = refused(
-        lambda: of(tmp_path / "x.mcap", log, options=counted), f"{tmp_path}/x.mcap: {TOPIC}: ticks that adv"
+        lambda: of(tmp_path / "x.mcap", log, options=counted), f"{tmp_path}/x.mcap: {TOPIC}: ticks advance"
     )
     assert "advance by 0.999 s, but messages arrive over 1.998 s; the largest difference is 0.499" in message
     assert "accepted: ticks of 1 ms, or logs.topics.low_state.stamps: receipt (or tick, to use them)" in message

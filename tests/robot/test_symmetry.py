@@ -117,7 +117,7 @@ def test_names_that_do_not_answer_to_each_other_are_refused(case: tuple, tmp_pat
 
 def test_joints_that_are_not_mirrored_are_refused_with_the_angle(tmp_path: Path) -> None:
     robot = mirrored_robot(tmp_path, np.random.default_rng(3), upper_axis=np.array([0.5, 0.0, 0.0]))
-    assert "the joints of left_upper and right_upper miss being " in refusal(robot, "left", "right")
+    assert "the joints of left_upper and right_upper are " in refusal(robot, "left", "right")
 
 
 def test_a_pair_of_which_one_has_no_mass_is_refused(tmp_path: Path) -> None:
