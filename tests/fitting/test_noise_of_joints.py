@@ -152,7 +152,7 @@ def test_stated_noise_is_that_of_the_pattern_with_most_letters(arm: Arm) -> None
     ("stated", "message"),
     [
         ("{'*': 0.5, wrist_4_joint: 0.1}", "sensors.noise.joint_torque: unknown name 'wrist_4_joint'; accepted: "),
-        ("{'wrist_*': 0.1}", "sensors.noise.joint_torque: no noise of shoulder_pan_joint; accepted: one for every"),
+        ("{'wrist_*': 0.1}", "sensors.noise.joint_torque: no noise for shoulder_pan_joint; accepted: one for every"),
         ("{'wrist_?_joint': 0.1, 'wrist_*_joint': 0.2, '*': 1}", "sensors.noise.joint_torque: two values for wrist_1"),
         ("{'*': 0}", "sensors.noise.joint_torque: found {'*': 0}; accepted: a number greater than 0, or one by name"),
         ("{'*': 0.1, wrist_1_joint: -1}", "sensors.noise.joint_torque: found {'*': 0.1, 'wrist_1_joint': -1}; acc"),

@@ -120,7 +120,7 @@ def test_the_largest_robot_is_built_and_a_larger_one_refused(tmp_path: Path, cha
         warnings.simplefilter("ignore", TorchidWarning)
         assert load_robot(path).n == MAX_LINKS - 1
     path.write_text(tree(MAX_LINKS + 1, chain))
-    with pytest.raises(UrdfError, match=f"link: {MAX_LINKS + 1} of them; accepted: at most {MAX_LINKS}"):
+    with pytest.raises(UrdfError, match=f"link: {MAX_LINKS + 1} links; accepted: at most {MAX_LINKS}"):
         load_robot(path)
 
 
