@@ -86,7 +86,7 @@ def compare(options: argparse.Namespace) -> None:
             seen, unseen = (trainer.loss.mean_square(MiniBatches(logs, builder)) ** 0.5 for logs in (train, test))
             used = {**hyperparameters(config), "estimator": f"sgd, {name}", "training.epochs": options.epochs}
             weight = {"training.residual_weight": options.weight if networks else 0.0}
-            events.write_hyperparameters(used | weight, {"unseen_rms": unseen, "train_rms": seen}, options.epochs)
+            events.write_hyperparameters(used | weight, ["loss_unseen/data", "loss/data"])
         shares = (f"{100.0 * epoch.shares.get(of, 0.0):.3g} %" for of in ("rigid_body", "residual"))
         table.add_row(name, f"{seen:.3f}", f"{unseen:.3f}", *shares)
     Console(width=100).print(table)

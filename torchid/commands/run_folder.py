@@ -330,24 +330,24 @@ def write_events(run: Results, folder: Path, figures: Mapping[str, bytes]) -> No
     robot = run.experiment.robot
     descent = isinstance(estimate, SgdEstimate)
     last = estimate.epochs if isinstance(estimate, SgdEstimate) else 1
+    known = known_parameters(robot, estimate, estimate.phi)
+    nominal = known_parameters(robot, estimate, robot.nominal.flatten())
+    if run.mass.determined and np.isfinite(run.mass.standard_error):
+        known["total_mass"] = run.mass.value, run.mass.standard_error
+        nominal["total_mass"] = run.mass.nominal, run.mass.standard_error
     with RunEvents(folder) as events:
         if not descent:  # which has said before what there is to show
             events.write_layout(robot.body_names)
-            events.write_solution(estimate, None if run.factors else run.samples / run.seconds["compress"])
-        for nominal, phi in ((True, robot.nominal.flatten()), (False, estimate.phi)):
-            events.write_errors(last, _errors(run, nominal), nominal=nominal)
-            events.write_eigenvalues(last, body_eigenvalues(robot, phi), nominal=nominal)
-        known = known_parameters(robot, estimate, estimate.phi)
-        if run.mass.determined and np.isfinite(run.mass.standard_error):
-            known["total_mass"] = run.mass.value, run.mass.standard_error
-        events.write_parameters(last, known)
+            events.write_solution(estimate)
+        for step, phi, values in ((0, robot.nominal.flatten(), nominal), (last, estimate.phi, known)):
+            events.write_errors(step, _errors(run, nominal=step == 0))
+            events.write_eigenvalues(step, body_eigenvalues(robot, phi))
+            events.write_parameters(step, values)
         events.write_answer(last, _answer_lines(run))
-        events.write_fit(last, estimate)
-        events.write_identifiability(
-            last, estimate, run.contributions.total, table_text(verdict_counts_table(run.by_state, estimate))
-        )
+        table = table_text(verdict_counts_table(run.by_state, estimate))
+        events.write_identifiability(last, estimate, table)
         events.write_summary(dump_config(run.experiment.config), figures, last)
-        events.write_hyperparameters(hyperparameters(run.experiment.config), _final(run), last)
+        events.write_hyperparameters(hyperparameters(run.experiment.config), _compared_tags(run))
 
 
 def _errors(run: Results, nominal: bool) -> dict[str, Metrics]:
@@ -371,18 +371,16 @@ def _answer_lines(run: Results) -> list[str]:
     return [said.headline, "", *errors, "", *named, *(f"attention: {text}" for text in said.attention)]
 
 
-def _final(run: Results) -> dict[str, float]:
-    """Errors of a finished run, and what it says of its optimum."""
-    estimate = run.estimate
-    final = {
-        f"{name}_{group}": value
-        for name in reversed(LOG_SETS)  # test logs first: TensorBoard shows the first few
+def _compared_tags(run: Results) -> list[str]:
+    """Charts whose last values compare runs, test logs first: TensorBoard shows the first few."""
+    tags = [
+        f"error_relative_{name}/{group}"
+        for name in reversed(LOG_SETS)
         if name in run.metrics
         for group, value in run.metrics[name].identified.relative.items()
         if value is not None
-    }
-    price = estimate.relative_increase if isinstance(estimate, ConstrainedEstimate) else 0.0
-    return final | {"rank": float(estimate.rank)} | ({} if price is None else {"objective_above_least": price})
+    ]
+    return [*tags, "optimum/objective_above_least"] if isinstance(run.estimate, SgdEstimate) else tags
 
 
 def hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:

@@ -11,14 +11,12 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-from torchid.estimators import ConstrainedEstimate, Epoch, Estimate
-from torchid.identifiability.information import InformationGain
+from torchid.estimators import Epoch, Estimate
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, LOG_SETS, ROW_GROUPS
 from torchid.report.figures import INTERVAL
 
 _RGBA = 4  # colour space in Summary.Image
-_NOMINAL = "_nominal"  # ends the names of charts of the nominal parameters
 _BY_EPOCH = "training_"  # begins those of curves
 _CHARTED = ("test", "left_out", "train")
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
@@ -28,9 +26,9 @@ _BOUNDS = ("_lower", "_upper")  # ends the names of charts of the ends of interv
 class RunEvents:
     """Event files of one run: results, curves of a descent, figures and settings.
 
-    Results of all estimators are charts of one point for each run, at its last step: TensorBoard smooths a curve of few
-    points into one that shows none of them. A descent has curves beside them, whose names begin with "training", over
-    its epochs after step 0, the nominal parameters. Tags sort by what should be seen first: errors.
+    Results of all estimators are lines from the nominal parameters, step 0, to the identified ones, the last step. A
+    descent also has curves over its epochs; their names begin with "training". Tags sort by what should be seen first:
+    errors.
     """
 
     def __init__(self, folder: Path, since: int | None = None) -> None:
@@ -46,7 +44,7 @@ class RunEvents:
         """
         layout: dict[str, dict[str, list[str | list[str]]]] = {}
         if bodies:
-            tags = [f"error_relative_{name}{kind}" for name in _CHARTED for kind in (_NOMINAL, "")]
+            tags = [f"error_relative_{name}" for name in _CHARTED]
             layout["errors, share of measured"] = _charts(tags, ERROR_GROUPS)
         if bodies and by_epoch is not None:
             tags = [f"{_BY_EPOCH}error_relative_{name}" for name in LOG_SETS]
@@ -75,31 +73,28 @@ class RunEvents:
         """Write buffered events."""
         self._writer.flush()
 
-    def write_errors(
-        self, step: int, sets: Mapping[str, Metrics], *, nominal: bool = False, by_epoch: bool = False
-    ) -> None:
-        """Errors by group of rows of one parameter vector, `nominal` or not, on sets of logs."""
+    def write_errors(self, step: int, sets: Mapping[str, Metrics], *, by_epoch: bool = False) -> None:
+        """Errors by group of rows of one parameter vector on sets of logs."""
         for name, metrics in sets.items():
             for kind, values in (("relative", metrics.relative), ("rms", metrics.rms)):
-                chart = f"{_BY_EPOCH * by_epoch}error_{kind}_{name}{_NOMINAL * nominal}"
+                chart = f"{_BY_EPOCH * by_epoch}error_{kind}_{name}"
                 self._add(step, {f"{chart}/{group}": values.get(group) for group in ERROR_GROUPS})
 
     def write_parameters(self, step: int, values: Mapping[str, tuple[float, float]], *, by_epoch: bool = False) -> None:
-        """Parameters and their standard errors by name, with the ends of their 95 % intervals."""
+        """Parameters by name, given with their standard errors; by epoch with the ends of their 95 % intervals, too."""
         tag = f"{_BY_EPOCH * by_epoch}parameter"
         for kind, sign in zip(("", *_BOUNDS), (0.0, -1.0, 1.0), strict=True):
-            ends = {name: value + sign * INTERVAL * error for name, (value, error) in values.items()}
-            self._add(step, {f"{tag}{kind}/{name}": end for name, end in ends.items()})
+            if not kind or by_epoch:
+                ends = {name: value + sign * INTERVAL * error for name, (value, error) in values.items()}
+                self._add(step, {f"{tag}{kind}/{name}": end for name, end in ends.items()})
 
     def write_answer(self, step: int, lines: Sequence[str]) -> None:
         """What the run says first, line by line."""
         self._writer.add_text("answer", _preformatted("\n".join(lines)), step)
 
-    def write_eigenvalues(
-        self, step: int, least: Mapping[str, float], *, nominal: bool = False, by_epoch: bool = False
-    ) -> None:
-        """Smallest eigenvalue of the scaled pseudo-inertia by body; negative: no such body exists."""
-        tag = f"{_BY_EPOCH * by_epoch}smallest_eigenvalue{_NOMINAL * nominal}"
+    def write_eigenvalues(self, step: int, least: Mapping[str, float], *, by_epoch: bool = False) -> None:
+        """Smallest eigenvalue of the scaled pseudo-inertia by body; negative: the body is not physically consistent."""
+        tag = f"{_BY_EPOCH * by_epoch}smallest_eigenvalue"
         self._add(step, {f"{tag}/{body}": value for body, value in least.items()})
 
     def write_epoch(self, epoch: Epoch, unseen: float | None = None) -> None:
@@ -121,44 +116,19 @@ class RunEvents:
         scalars |= {f"loss/{name}": value for name, value in epoch.losses.items()}
         self._add(epoch.number, scalars | {f"share_of_force/{name}": value for name, value in epoch.shares.items()})
 
-    def write_solution(self, estimate: Estimate, samples_per_second: float | None) -> None:
-        """Losses of a batch fit, in the charts of a descent.
+    def write_solution(self, estimate: Estimate) -> None:
+        """Loss of a batch fit, in the chart of a descent."""
+        for step, cost in enumerate((estimate.nominal_cost, estimate.cost)):
+            self._add(step, {"loss/data": cost / max(estimate.rows, 1)})
 
-        Args:
-            estimate: the fit.
-            samples_per_second: of the stream through the logs, None without one.
-        """
-        rows = max(estimate.rows, 1)
-        scalars = {
-            f"loss{_NOMINAL}/data": estimate.nominal_cost / rows,
-            "loss/data": estimate.cost / rows,
-            "training/samples_per_second": samples_per_second,
-        }
-        if isinstance(estimate, ConstrainedEstimate):
-            scalars |= {
-                "loss/prior": estimate.objective - estimate.cost / rows,
-                "optimum/distance": estimate.distance,
-                "optimum/objective_above_least": estimate.relative_increase,
-            }
-        self._add(1, scalars)
-
-    def write_fit(self, step: int, estimate: Estimate) -> None:
-        """Statistics of the problem."""
-        condition = estimate.condition_number if estimate.rank else None
-        scalars = {"residual_std": estimate.residual_std, "rank": estimate.rank, "condition_number": condition}
-        self._add(step, {f"fit/{name}": value for name, value in scalars.items()})
-
-    def write_identifiability(self, step: int, estimate: Estimate, gain: InformationGain, table: str) -> None:
-        """Verdicts, information and singular values; in the chart of the latter, steps are their numbers.
+    def write_identifiability(self, step: int, estimate: Estimate, table: str) -> None:
+        """Verdicts and singular values; in the chart of the latter, steps are their numbers.
 
         Args:
             step: of all other charts.
             estimate: the fit.
-            gain: information gained from all data.
             table: of the verdicts by contact state.
         """
-        scalars = {f"verdicts/{verdict}": float(count) for verdict, count in estimate.verdict_counts().items()}
-        self._add(step, scalars | {"identifiability/bits": gain.bits, "identifiability/combinations": gain.determined})
         self._writer.add_text("verdicts", _preformatted(table), step)
         for index, value in enumerate(estimate.singular_values):
             self._writer.add_scalar("identifiability/singular_value", value, index)
@@ -172,14 +142,10 @@ class RunEvents:
             value = Summary.Value(tag=f"figure_{number}_{name}", image=image)
             self._writer.file_writer.add_summary(Summary(value=[value]), step)
 
-    def write_hyperparameters(
-        self, settings: Mapping[str, str | float | bool], final: Mapping[str, float], step: int
-    ) -> None:
-        """Settings and final metrics, a row for each run in the tab *HParams*; the same keys for all of them."""
-        named = {f"final/{name}": value for name, value in final.items()}
-        for summary in hparams(dict(settings), named):  # add_hparams would write a run of its own
+    def write_hyperparameters(self, settings: Mapping[str, str | float | bool], tags: Sequence[str]) -> None:
+        """Settings, a row for each run in the tab *HParams*, beside the last values of charts with these tags."""
+        for summary in hparams(dict(settings), dict.fromkeys(tags, 0.0)):  # add_hparams would write a run of its own
             self._writer.file_writer.add_summary(summary)
-        self._add(step, named)
 
     def _add(self, step: int, scalars: Mapping[str, float | None]) -> None:
         """Add a point to the chart of each tag; None: there is none."""
