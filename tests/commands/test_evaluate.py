@@ -13,6 +13,7 @@ import pytest
 from demo import shortened_demo
 from refusals import files_in
 
+import torchid
 from torchid.cli import main
 from torchid.commands.folder import EVALUATION, read_manifest
 from torchid.parameters import Array
@@ -95,11 +96,11 @@ def test_the_figure_shows_errors_in_a_band_of_two_standard_deviations() -> None:
         nominal, identified = errors.get_lines()
         np.testing.assert_allclose(np.nanmax(np.asarray(nominal.get_ydata(), dtype=float)), 1.0)
         np.testing.assert_allclose(np.nanmax(np.asarray(identified.get_ydata(), dtype=float)), 0.1)
-        assert errors.get_title(loc="left") == "identified: rms 0.1, noise alone 0.2 [N m]"
+        assert errors.get_title(loc="left") == "rms error: URDF 1, identified 0.1, noise 0.2 N m"
     for noise in (None, np.full((50, 2), np.nan)):
         for errors in force_figure(series(noise), ["knee", "hip"], 0).axes[1::2]:
             assert not errors.collections
-            assert errors.get_title(loc="left") == "identified: rms 0.1 [N m]"
+            assert errors.get_title(loc="left") == "rms error: URDF 1, identified 0.1 N m"
 
 
 def test_the_figure_has_forces_of_slides_in_newtons_and_seconds_since_the_first_sample() -> None:
@@ -109,3 +110,21 @@ def test_the_figure_has_forces_of_slides_in_newtons_and_seconds_since_the_first_
     for figure, label in ((as_recorded, "time [s]"), (since_1970, "time since the first sample [s]")):
         np.testing.assert_allclose(figure.axes[0].get_lines()[0].get_xdata(), series(None).time, atol=1e-6)
         assert {axis.get_xlabel() for axis in figure.axes} == {"", label}
+
+
+@UNPHYSICAL
+def test_without_contact_forces_the_figure_has_joint_torques_of_the_whole_log(
+    demo: tuple[Path, str], tmp_path: Path
+) -> None:
+    with np.load(demo[0] / "sway_test.npz") as arrays:
+        np.savez(tmp_path / "torques.npz", **{name: x for name, x in arrays.items() if "wrench" not in name})
+    forces = torchid.evaluate(demo[0] / "run", [tmp_path / "torques.npz"]).forces
+    assert forces.recovered
+    assert np.isnan(forces.measured[:, :6]).all()
+    assert np.isfinite(forces.measured[:, 6:]).all()
+    assert forces.noise is not None
+    error, before = (x[:, 6:] - forces.measured[:, 6:] for x in (forces.identified, forces.nominal))
+    rms = np.sqrt(np.mean(np.square(error), axis=0))
+    ratio = rms / np.sqrt(np.mean(np.square(forces.noise[:, 6:]), axis=0))
+    assert ((ratio > 0.8) & (ratio < 2.0)).all(), "noise, and errors of a fit of 400 samples"
+    assert (rms < 0.2 * np.sqrt(np.mean(np.square(before), axis=0))).all()

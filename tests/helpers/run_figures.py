@@ -14,12 +14,10 @@ from torchid.report import figure_style
 
 FIGURES = (
     *("force_figure", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure"),
-    *("rows_figure", "spectrum_figure", "inertia_figure"),
-    *("pressure_figure", "extra_figure", "ridge_figure", "tree_figure", "accuracy_figure"),
+    *("spectrum_figure", "inertia_figure"),
+    *("pressure_figure", "extra_figure", "ridge_figure", "tree_figure"),
 )
-OF_A_RUN = (
-    *("forces", "pressure", "rows", "spectra", "errors", "parameters", "identifiability", "inertia", "contributions"),
-)
+OF_A_RUN = (*("forces", "pressure", "spectra", "errors", "parameters", "identifiability", "inertia", "contributions"),)
 """Names of the figures that every run of logs has, in their order."""
 
 PAGE, EVENTS = "write_page", "write_events"

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from torchid.report.forces import ForceSeries, LogForces, _spans, _spectrum, _Thinned, rows_figure, spectrum_figure
+from torchid.report.forces import ForceSeries, _spans, _spectrum, _Thinned, force_figure, spectrum_figure
 
 RATE, STD = 200.0, 0.3
 
 
-def forces(samples: int, spike: int | None = None, gap: int | None = None, step: int = 1) -> LogForces:
+def forces(samples: int, spike: int | None = None, gap: int | None = None, step: int = 1) -> ForceSeries:
     """Forces of two joints, measured with white noise; the identified parameters leave nothing but that."""
     rng = np.random.default_rng(0)
     time = 5.0 + np.arange(samples) * step / RATE
@@ -23,14 +24,19 @@ def forces(samples: int, spike: int | None = None, gap: int | None = None, step:
     if spike is not None:
         measured[spike] += 100.0
     noise = np.full_like(true, STD)
-    series = ForceSeries("log.npz", time, measured, 1.2 * true, true, noise)
     state = (np.arange(samples) >= samples // 2).astype(int)
-    return LogForces(series, ("none", "foot"), state, 0.5 * RATE / step)
+    series = ForceSeries("log.npz", time, measured, 1.2 * true, true, noise, states=("none", "foot"), state=state)
+    return replace(series, bandwidth=0.5 * RATE / step)
+
+
+def stays(log: ForceSeries) -> list[tuple[float, float, int]]:
+    assert log.state is not None
+    return _spans(log.time, log.state)
 
 
 @pytest.mark.parametrize("samples", [1500, 50_001])
 def test_a_peak_of_one_sample_is_seen_however_long_the_log_is(samples: int) -> None:
-    series = forces(samples, spike=1234).projected
+    series = forces(samples, spike=1234)
     thin = _Thinned(series.time)
     values = thin(series.measured[:, 0])
     assert len(values) == len(thin.time) <= 2000
@@ -41,20 +47,19 @@ def test_a_peak_of_one_sample_is_seen_however_long_the_log_is(samples: int) -> N
 @pytest.mark.parametrize("samples", [1500, 50_001])
 def test_no_line_and_no_contact_state_crosses_a_gap(samples: int) -> None:
     log = forces(samples, gap=700)
-    thin = _Thinned(log.projected.time)
-    values, middle = thin(log.projected.measured[:, 0]), log.projected.time[700] - 5.0
+    thin = _Thinned(log.time)
+    assert thin.has_gaps
+    values, middle = thin(log.measured[:, 0]), log.time[700] - 5.0
     assert np.isnan(values[np.flatnonzero(thin.time < middle)[-1] + 1])
-    spans = _spans(log.projected.time, log.state)
-    assert all(end - start < 10.0 or start > middle or end < middle for start, end, _ in spans)
+    assert all(end - start < 10.0 or start > middle or end < middle for start, end, _ in stays(log))
 
 
 def test_contact_states_cover_the_log() -> None:
     log = forces(1000)
-    time = log.projected.time - log.projected.time[0]
-    (first, changed, before), (again, end, after) = _spans(time, log.state)
-    assert (first, before, after) == (0.0, 0, 1)
-    assert changed == again == 500 / RATE
-    assert end == pytest.approx(time[-1])
+    (first, changed, before), (again, end, after) = stays(log)
+    assert (first, before, after) == (log.time[0], 0, 1)
+    assert changed == again == log.time[500]
+    assert end == pytest.approx(log.time[-1])
 
 
 @pytest.mark.parametrize("step", [1, 4])
@@ -62,7 +67,7 @@ def test_white_noise_lies_at_the_noise_floor_at_all_frequencies(step: int) -> No
     """Of std s up to B hertz the amplitude density is s / sqrt(B); 20 averaged segments leave it 16 % of scatter."""
     log = forces(10_000, step=step)
     for row in range(2):
-        spectrum = _spectrum(log.projected, row, log.projected.time, log.bandwidth)
+        spectrum = _spectrum(log, row, log.time)
         assert spectrum is not None
         floor = STD / np.sqrt(0.5 * RATE / step)
         assert spectrum.noise == pytest.approx(floor, rel=1e-6)
@@ -70,12 +75,12 @@ def test_white_noise_lies_at_the_noise_floor_at_all_frequencies(step: int) -> No
         assert spectrum.nominal.max() > 2.0 * floor
 
 
-def test_rows_and_spectra_are_named_with_units_and_states_with_colours() -> None:
-    rows = rows_figure(forces(1000), ("hip", "sensor.fx"), 0)
+def test_forces_and_spectra_are_named_with_units_and_states_with_colours() -> None:
+    rows = force_figure(forces(1000), ("hip", "sensor.fx"), 0)
     titles = [axis.get_title(loc="left") for axis in rows.axes]
     assert titles[0::2] == ["hip", "sensor.fx"]
     assert [axis.get_ylabel() for axis in rows.axes[0::2]] == ["[N m]", "[N]"]
-    rms, noise = map(float, re.findall(r"rms ([\d.]+), noise alone ([\d.]+)", titles[1])[0])
+    rms, noise = map(float, re.findall(r"identified ([\d.]+), noise ([\d.]+)", titles[1])[0])
     assert (rms, noise) == pytest.approx((STD, STD), rel=0.05)
     assert "foot" in [text.get_text() for text in rows.legends[0].get_texts()]
     spectra = spectrum_figure(forces(1000), ("hip", "sensor.fx"), 0)

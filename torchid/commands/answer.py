@@ -364,7 +364,7 @@ def _implicit(run: Results) -> Iterator[str]:
     kd = values_by_name("logs.columns.joint_torque.pd.kd", torque.pd.kd.value, robot.joint_names)
     known = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
     added = {x.extra.name: x.value - known[x.extra.name] for x in run.extras if x.extra.what == "armature"}
-    if step := implicit_step(kd, added, float(np.median(np.diff(run.forces.time)))):
+    if step := implicit_step(kd, added, 1.0 / run.forces.rate):
         yield f"armatures are {1e3 * step:.2g} ms times the stated kd: no rotors, but a simulator's implicit PD law"
 
 

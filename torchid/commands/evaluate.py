@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 from pydantic import TypeAdapter
 from rich.progress import Progress
 
@@ -38,13 +37,14 @@ from torchid.problem.metrics import (
     group_name,
     noise_series,
     pressure_series,
-    projected_forces,
+    torque_noise_series,
+    torque_series,
 )
 from torchid.problem.samples import is_at_rest
 from torchid.reading.log_reader import LogReader
 from torchid.report.figure_style import save_figures
 from torchid.report.figures import error_figure
-from torchid.report.forces import ForceSeries, LogForces
+from torchid.report.forces import ForceSeries
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.report.tables import progress_bars
 from torchid.reprs import short_repr
@@ -55,8 +55,8 @@ _METRICS = "metrics.json"
 _NOISE: TypeAdapter[NoiseConfig] = TypeAdapter(NoiseConfig)
 FAR_OFF = 5.0
 """Times the error on the run's own logs from which on a log is not one of the same robot, moving otherwise."""
-_SAMPLES = 3000
-_TRACED = 10_000  # of a whole log: the rows of the fit take 0.1 ms each
+_SAMPLES = 10_000  # of a log, that figures show
+_MOST_UNKNOWN = 0.1  # share of samples with unknown generalized forces up to which figures show these
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class EvaluatedRun:
     Attributes:
         metrics: errors of the nominal and identified parameters, by log name.
         excluded: number of rejected samples, by log name.
-        forces: measured and predicted forces of the first samples of the first log.
+        forces: measured and predicted forces of the first log.
         robot: of the run.
         at_rest: names of logs without motion.
         usual: errors on the run's own logs, by group of rows (the larger of train and test).
@@ -364,49 +364,49 @@ def _usual(documents: Sequence[Mapping[str, object]]) -> dict[str, float]:
 
 
 def compare_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> ForceSeries:
-    """Forces of the first samples of a log: nominal, identified, and measured as the latter calibrates it.
+    """Forces of a whole log: nominal, identified, and measured as the latter calibrates it.
 
-    Each prediction is as far from what was measured as from readings that are calibrated for it.
+    Generalized forces if contact forces are measured, else joint torques by `torque_series`. Each prediction is as far
+    from what was measured as from readings that are calibrated for it. Of a long log every k-th sample.
     """
-    measured = []
-    predicted = []
-    for calibration in compared:
-        (read,) = calibration.calibrate([samples])
-        part = read[:_SAMPLES]
-        series = force_series(evaluation.builder, part, calibration.parameters(evaluation)[None])
-        readings, forces = at_motors(evaluation.builder, part, np.stack([series[0], *series[1]]))
-        measured.append(readings)
-        predicted.append(forces)
-    nominal = predicted[0] + np.nan_to_num(measured[1] - measured[0])  # NaN: not measured
-    noise = None if evaluation.noise is None else noise_series(evaluation.builder, part, evaluation.noise)
-    forces = measured[1], nominal, predicted[1]
-    pressure = None
-    if evaluation.robot.base_rows:
-        pressure = pressure_series(evaluation.builder, part, np.stack(forces)[..., :6], evaluation.least_carried)
-    return ForceSeries(log_title(samples.source), part.time.numpy(), *forces, noise, pressure)
-
-
-def trace_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> LogForces:
-    """Forces of a whole log in the rows of the fit; of a long log every k-th sample."""
-    step = max(1, -(-len(samples) // _TRACED))
-    part = samples.every(step)
-    builder = compared.identified.builder
-    projected = projected_forces(
-        builder, part, torch.stack([calibration.columns(builder, samples) for calibration in compared])
+    builder = evaluation.builder
+    base = evaluation.robot.base_rows
+    step = max(1, -(-len(samples) // _SAMPLES))
+    parts = [calibration.calibrate([samples], step)[0] for calibration in compared]
+    part = parts[1]
+    series = [
+        force_series(builder, readings, calibration.parameters(evaluation)[None])
+        for readings, calibration in zip(parts, compared, strict=True)
+    ]
+    torques = [torque_series(builder, readings, forces) for readings, (_, forces) in zip(parts, series, strict=True)]
+    unknown = np.isnan(series[1][0]) & np.isfinite(torques[1][0])
+    recovered = bool(len(part)) and unknown[:, base:].any(axis=1).mean() > _MOST_UNKNOWN
+    (measured, nominal), (calibrated, identified) = (
+        at_motors(builder, readings, np.stack([forces, *predicted]))
+        for readings, (forces, predicted) in zip(parts, torques if recovered else series, strict=True)
     )
+    forces = np.stack([calibrated, nominal + np.nan_to_num(calibrated - measured), identified])  # NaN: not measured
+    noise = None
+    if evaluation.noise is not None:
+        noise = (torque_noise_series if recovered else noise_series)(builder, part, evaluation.noise)
+    pressure = None
+    if recovered:
+        forces[..., :base] = np.nan
+    elif base:
+        pressure = pressure_series(builder, part, forces[..., :6], evaluation.least_carried)
     present = list(dict.fromkeys(map(tuple, part.active.tolist())))
-    names = {state: state_name(builder.contacts, state) for state in present}
     rate = 1.0 / float(samples.time.diff().median()) if len(samples) > 1 else np.nan
-    return LogForces(
-        projected=ForceSeries(
-            source=log_title(samples.source),
-            time=part.time.numpy(),
-            measured=projected.measured,
-            nominal=projected.predicted[0],
-            identified=projected.predicted[1],
-            noise=projected.noise,
-        ),
-        states=tuple(names.values()),
+    return ForceSeries(
+        source=log_title(samples.source),
+        time=part.time.numpy(),
+        measured=forces[0],
+        nominal=forces[1],
+        identified=forces[2],
+        noise=noise,
+        pressure=pressure,
+        recovered=recovered,
+        states=tuple(state_name(builder.contacts, state) for state in present),
         state=np.array([present.index(tuple(active)) for active in part.active.tolist()]),
+        rate=rate,
         bandwidth=0.5 * rate / max(samples.oversampling, step),
     )

@@ -14,7 +14,7 @@ from rich.progress import Progress
 
 from torchid import distributed
 from torchid.commands.chosen_settings import Choices, with_chosen_settings, with_ridge, with_sample_rates
-from torchid.commands.evaluate import compare_forces, trace_forces
+from torchid.commands.evaluate import compare_forces
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import TrainingLogs, require_not_worse, require_plausible, suspected_mistake
 from torchid.commands.run_folder import Identification, write_run
@@ -125,13 +125,12 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         problem = fit.assembly.problem
         compared = calibrations(fit, experiment.robot, builder)
         shown = [*logs["test"], *logs["train"]][:1]
-        forces = distributed.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
     with clock("identifiability"):
         by_state, added = _identifiability(fit, fitter, data, bars)
     with clock("evaluate"):
         scorer = Scorer(evaluation, builder)
         held_out, metrics, evaluated = _errors(scorer, fit, fitter, compared, data, bars)
-        traces = distributed.from_first(lambda: [trace_forces(evaluation, log, compared) for log in shown], "traces")
+        forces = distributed.from_first(lambda: [compare_forces(evaluation, log, compared) for log in shown], "forces")
         friction = unfitted_friction(problem, experiment.robot)
 
     phi, scale = (x.reshape(-1, PER_BODY) for x in (fit.estimate.phi, problem.scale))
@@ -162,7 +161,6 @@ def _identify(config: ExperimentConfig, resume: bool, bars: Progress) -> tuple[I
         ridge=ridge,
         choices=with_sample_rates(data.choices, experiment, logs["train"]),
         forces=next(iter(forces), None),
-        traces=next(iter(traces), None),
     )
     logs.clear()  # checks of a log and figures need room, too
     data.blocks = []

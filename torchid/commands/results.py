@@ -31,7 +31,7 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import WorseThanNominal, worse_than_nominal
 from torchid.problem.noise_gram import NoiseShares
 from torchid.report import FittedJoints
-from torchid.report.forces import ForceSeries, LogForces
+from torchid.report.forces import ForceSeries
 from torchid.report.robot_files import refused_by_simulators
 from torchid.report.tables import table_text
 from torchid.robot import Robot
@@ -267,8 +267,7 @@ class Results:
         validation: errors on held-out blocks, None where the samples are too few to leave some out.
         ridge: how it was chosen, if it was.
         choices: how other settings were chosen, if they were.
-        forces: of the first samples of a log, as measured and as predicted; None where there are but factors.
-        traces: of all of that log, in the rows of the fit.
+        forces: of a log, as measured and as predicted; None where there are but factors.
         suspected: what the checks find in its training logs if it is doubtful, in words.
     """
 
@@ -297,7 +296,6 @@ class Results:
     ridge: RidgeChoice | None
     choices: Choices
     forces: ForceSeries | None
-    traces: LogForces | None
     suspected: str = ""
 
     def __getitem__(self, name: str) -> BodyEstimate:

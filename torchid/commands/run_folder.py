@@ -41,7 +41,6 @@ from torchid.logs.time_range import log_title
 from torchid.parallel import share_between_forks, thread_count
 from torchid.parameters import PER_BODY
 from torchid.problem import Metrics
-from torchid.problem.contact_state import IN_THE_AIR
 from torchid.problem.extras import NoiseGroups
 from torchid.problem.metrics import LOG_SETS, describe_worse
 from torchid.report import identified_name, identified_robot, identified_urdf, parameters_document
@@ -55,7 +54,7 @@ from torchid.report.figures import (
     parameter_figure,
     ridge_figure,
 )
-from torchid.report.forces import ForceSeries, force_figure, pressure_figure, rows_figure, spectrum_figure
+from torchid.report.forces import ForceSeries, force_figure, pressure_figure, spectrum_figure
 from torchid.report.log_checks import log_check_document
 from torchid.report.page import FIGURES, RunFiles, page_text, versions
 from torchid.report.tables import table_text, verdict_counts_table
@@ -267,11 +266,6 @@ def run_figures(run: Results) -> Figures:
     estimate = run.estimate
     kinds = {body.joint.kind for body in robot.bodies if body.joint is not None}
     figures = Figures() if run.forces is None else force_figures(run.forces, robot)
-    if run.traces is not None:
-        args = run.traces, robot.dof_names, robot.base_rows, robot.sliding, robot.format
-        if "forces" not in figures or run.traces.states != (IN_THE_AIR,):  # else the same once more
-            figures["rows"] = partial(rows_figure, *args)
-        figures["spectra"] = partial(spectrum_figure, *args)
     figures["errors"] = partial(error_figure, run.metrics, robot.format)
     figures["parameters"] = partial(parameter_figure, robot.body_names, robot.nominal, estimate, kinds, robot.format)
     figures["identifiability"] = partial(identifiability_figure, robot.body_names, estimate)
@@ -285,14 +279,17 @@ def run_figures(run: Results) -> Figures:
 
 
 def force_figures(series: ForceSeries, robot: Robot) -> Figures:
-    """Those of forces of a log's first samples, as far as these are measured."""
+    """Those of the forces of a log, as far as these are measured."""
     figures = Figures()
     args = (robot.dof_names, robot.base_rows, robot.sliding, robot.format)
     if series.known:
         figures["forces"] = partial(force_figure, series, *args)
     if series.pressure is not None and np.isfinite(series.pressure[0]).any():
-        points = ForceSeries(series.source, series.time, *series.pressure)
+        measured, nominal, identified = series.pressure
+        points = replace(series, measured=measured, nominal=nominal, identified=identified, noise=None)
         figures["pressure"] = partial(pressure_figure, points, robot.format)
+    if series.known:
+        figures["spectra"] = partial(spectrum_figure, series, *args)
     return figures
 
 

@@ -16,7 +16,7 @@ from torchid.errors import format_percent, join_names
 from torchid.logs.spill import Spill
 from torchid.parallel import one_thread
 from torchid.parameters import GRAVITY, MASS, Array
-from torchid.problem.chunks import CHUNK, ProgressCallback, blocks_in, chunks_by_state, map_chunks
+from torchid.problem.chunks import ProgressCallback, blocks_in, chunks_by_state, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ACTUATORS, Extra, ExtraTerms, contact_extra_column, dof_extra_column
 from torchid.problem.null_bases import leave_out_torques
@@ -28,7 +28,6 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 _ROWS = 2**16  # of a log on disk that are in memory at a time
-_DENSE_CHUNK = 512  # samples whose rows are dense
 _NOISE_SAMPLES = 64  # of a chunk, for the noise of its measured forces
 
 
@@ -250,7 +249,6 @@ def _series(
     builder: RowBuilder,
     samples: Samples,
     compute: Callable[[Samples, ContactState, _Where], Sequence[Tensor]],
-    size: int = CHUNK,
 ) -> list[Array]:
     """Arrays (..., N, columns) of a log in its order.
 
@@ -259,10 +257,9 @@ def _series(
         samples: of the log.
         compute: (..., B, columns) each, of samples of one contact state on that device, and where in the log's order
             these belong.
-        size: samples of a chunk at most.
     """
     out: list[Array] = []
-    for state, index in chunks_by_state(samples, size) if len(samples) else [((False,) * len(builder.contacts), EVERY)]:
+    for state, index in chunks_by_state(samples) if len(samples) else [((False,) * len(builder.contacts), EVERY)]:
         where = index if isinstance(index, slice) else index.numpy()
         parts = compute(samples[index].to(builder.device), state, where)
         out = out or [np.empty((*part.shape[:-2], len(samples), part.shape[-1])) for part in parts]
@@ -337,42 +334,29 @@ def at_motors(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
     return _series(builder, samples, compute)[0]
 
 
-@dataclass(frozen=True)
-class ProjectedForces:
-    """Generalized forces V_x V_x^T f of a log, rows as in K, with what a fit predicts of them [N, N m].
+def torque_series(builder: RowBuilder, samples: Samples, predicted: Array) -> tuple[Array, Array]:
+    """Measured joint torques (N, n_rows) and predicted ones (M, N, n_rows) of a log in its order [N m], base rows 0.
 
-    `measured`, (N, n_rows), as recorded: predictions have offsets and scales. `predicted`, (M, N, n_rows). `noise`,
-    (N, n_rows): standard deviation that the noise of the readings gives the measured. NaN where readings lack, in rows
-    that no reading is of, and of all noise under task weights.
+    The predicted torques contain the contact forces that explain the measured torques best, in least squares: no
+    contact force need be measured. `predicted`: K phi of `force_series`.
     """
 
-    measured: Array
-    predicted: Array
-    noise: Array
+    def compute(part: Samples, *_: object) -> list[Tensor]:
+        return [torch.nn.functional.pad(builder.recorded_torque(part), (builder.tree.base_rows, 0))]
+
+    (torque,) = _series(builder, samples, compute)
+    return torque, torque + null_space_part(builder, samples, predicted - torque)
 
 
-def projected_forces(builder: RowBuilder, samples: Samples, phi: torch.Tensor) -> ProjectedForces:
-    """The rows of a fit, W^T [K phi, f], mapped back by W (W^T W)^-1, whose span is that of V_x.
-
-    Args:
-        builder: of the rows.
-        samples: of one log.
-        phi: (M, width), parameters in the builder's columns, extra ones included.
-    """
-
-    def compute(part: Samples, state: ContactState, _: _Where) -> list[Tensor]:
-        rows, W = builder.rows_by_sample(part, state)
-        gram = W.mT @ W
-        gram.diagonal(dim1=1, dim2=2)[(W == 0.0).all(1)] = 1.0  # of samples with fewer rows
-        back = torch.linalg.solve(gram, W.mT).mT
-        forces = back @ torch.cat([rows[..., -1:], rows[..., :-1] @ phi.T], dim=2)
-        forces[(W == 0.0).all(2)] = torch.nan
-        noise = (back.square().sum(2) * part.noise_left).sqrt()
-        if builder.task_weights is not None:
-            noise = torch.full_like(noise, torch.nan)  # rows are white in other units
-        return [forces[..., 0], forces[..., 1:].permute(2, 0, 1), noise]
-
-    return ProjectedForces(*_series(builder, samples, compute, _DENSE_CHUNK))
+def torque_noise_series(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Array:
+    """Standard deviation of the errors of `torque_series` by the noise of the torques, (N, n_rows) [N m]."""
+    step = -(-len(samples) // _NOISE_SAMPLES)  # it hardly changes
+    few = samples.every(step)
+    base = builder.tree.base_rows
+    std = noise.dof_std(builder.tree.n, builder.tree.n_rows - base)
+    units = np.pad(np.diag(std), ((0, 0), (base, 0)))[:, None].repeat(len(few), axis=1)
+    variance = np.square(null_space_part(builder, few, units)).sum(axis=0) * few.noise_left
+    return np.sqrt(variance).repeat(step, axis=0)[: len(samples)]
 
 
 # -------------------------------------------------------------------------------------------------- sums of squares

@@ -22,6 +22,7 @@ from torchid.report.figure_style import (
     NOISE_COLOR,
     NOMINAL_COLOR,
     STYLE,
+    WIDTH,
     draw_panels,
     label_decades,
     set_headline,
@@ -45,10 +46,21 @@ _BEYOND = 2.0  # frequencies are shown up to so many times the band of the noise
 
 @dataclass(frozen=True)
 class ForceSeries:
-    """Forces of one log for plotting: `measured`, `nominal`, `identified`, (N, n_rows) each, NaN where unknown.
+    """Forces of one log for plotting.
 
-    `noise`, (N, n_rows): standard deviation that the noise of the readings gives the measured; None where unknown.
-    `pressure`, (3, N, 3) [m]: centres of pressure of the same three, from `pressure_series`; None of a fixed base.
+    Attributes:
+        source: what the log is called.
+        time: (N,) [s].
+        measured: (N, n_rows) [N, N m], NaN where unknown.
+        nominal: predicted by the nominal parameters.
+        identified: predicted by the identified parameters.
+        noise: standard deviation that the noise of the readings gives the errors; None where unknown.
+        pressure: (3, N, 3) [m], measured, nominal and identified centres of pressure; None without any.
+        recovered: whether these are joint torques, predicted with the contact forces that fit best.
+        states: names of the contact states.
+        state: (N,), number of the contact state of each sample.
+        rate: of the log [Hz], which may have more samples.
+        bandwidth: up to which frequency there is noise [Hz].
     """
 
     source: str
@@ -58,6 +70,11 @@ class ForceSeries:
     identified: Array
     noise: Array | None = None
     pressure: Array | None = None
+    recovered: bool = False
+    states: tuple[str, ...] = ()
+    state: np.ndarray | None = None
+    rate: float = np.nan
+    bandwidth: float = np.nan
 
     @property
     def known(self) -> bool:
@@ -71,33 +88,36 @@ def force_figure(
     base_rows: int,
     sliding: Collection[str] = (),
     nominal_label: str = "URDF",
+    rows: Sequence[int] | None = None,
 ) -> Figure:
-    """Forces over time, and beside them their errors: the largest base force and moment, then the largest others.
+    """Forces over time, and beside them their errors; colours behind them are contact states.
 
-    `dof_names`, `base_rows` and `sliding` are those of the robot, `nominal_label` is its kind of file.
+    `dof_names`, `base_rows` and `sliding` are those of the robot, `nominal_label` is its kind of file. `rows`: which;
+    the largest if not given.
     """
-    names = _largest(series, dof_names, base_rows, sliding)
+    shown_rows = _largest(series, base_rows) if rows is None else rows
+    names = {row: name_row(row, base_rows, dof_names, sliding) for row in shown_rows}
     known = int(np.isfinite(series.measured).any(axis=0).sum())
-    shown = f" ({len(names)} of {known} rows, the largest)" if len(names) < known else ""
-    gaps = "; gaps: forces without a sensor act" if np.isnan(series.measured[:, list(names)]).any() else ""
-    return _figure(series, names, f"Generalized forces{shown}, {series.source}", nominal_label, gaps)
+    kind = (
+        "Joint torques, predicted with the contact forces that fit best" if series.recovered else "Generalized forces"
+    )
+    shown = f"; the {len(names)} largest of {known}" if rows is None and len(names) < known else ""
+    return _figure(series, names, f"{kind}: {series.source}{shown}", nominal_label)
 
 
 @matplotlib.rc_context(STYLE)
-def _figure(
-    series: ForceSeries,
-    rows: Mapping[int, tuple[str, str]],
-    title: str,
-    nominal_label: str,
-    gaps: str = "",
-    states: Sequence[Patch] = (),
-) -> Figure:
-    """Some rows over time, by name and unit, and their errors; `states` are further marks of the legend."""
+def _figure(series: ForceSeries, rows: Mapping[int, tuple[str, str]], title: str, nominal_label: str) -> Figure:
+    """Some rows over time, by name and unit, and their errors."""
     series, since = _from_its_start(series)
     thin = _Thinned(series.time)
-    columns = 3 if states else 4  # of the legend
-    legend = _LEGEND_ROW * -(-(_CURVES + len(states)) // columns)
-    size = 12.0, 1.7 * max(len(rows), 1) + 0.8
+    spans = [] if series.state is None else _spans(series.time, series.state)
+    lasted = [sum(end - start for start, end, number in spans if number == k) for k in range(len(series.states))]
+    colored = np.argsort(lasted)[::-1][1:].tolist()  # the longest stays white
+    colors = {k: CATEGORY_COLORS[place % len(CATEGORY_COLORS)] for place, k in enumerate(colored)}
+    patches = [Patch(color=color, alpha=0.25, label=series.states[k]) for k, color in colors.items()][:_NAMED_STATES]
+    columns = 3 if patches else 4  # of the legend
+    legend = _LEGEND_ROW * -(-(_CURVES + len(patches)) // columns)
+    size = WIDTH, 1.7 * max(len(rows), 1) + 0.8
     figure, axes = draw_panels(
         max(len(rows), 1), 2, size, bottom=0.5 + legend, down=0.36, sharex=True, width_ratios=(3, 2)
     )
@@ -110,23 +130,28 @@ def _figure(
             forces.plot(thin.time, thin(values[:, row]), color=color, linewidth=width, label=label)
         forces.set_title(name, loc="left", fontsize=9)
         forces.set_ylabel(f"[{unit}]")
-        _draw_errors(errors, series, row, thin, f"[{unit}]")
+        _draw_errors(errors, series, row, thin, unit, nominal_label)
+        for axis in (forces, errors):
+            for state, color in colors.items():
+                stays = [(start, end - start) for start, end, number in spans if number == state]
+                style: dict[str, Any] = {"color": color, "alpha": 0.25, "linewidth": 0.0, "zorder": 0}
+                axis.broken_barh(stays, (0.0, 1.0), transform=axis.get_xaxis_transform(), **style)
     if rows:
         handles, labels = (a + b for a, b in zip(*(x.get_legend_handles_labels() for x in axes[0]), strict=True))
-        labels += [str(patch.get_label()) for patch in states]
-        figure.legend([*handles, *states], labels, loc="lower center", ncols=columns)
+        labels += [str(patch.get_label()) for patch in patches]
+        figure.legend([*handles, *patches], labels, loc="lower center", ncols=columns)
     for axis in axes[-1]:
-        axis.set_xlabel(f"time{since} [s]")
+        axis.set_xlabel(f"time{since} [s]" + "; gaps: samples left out" * thin.has_gaps)
     if len(series.time) and 0.0 <= series.time[0] < _NEAR_0 * series.time[-1]:
         axes[0, 0].set_xlim(left=0.0)
-    set_headline(figure, f"{title}, and errors: predicted - measured{gaps}")
+    set_headline(figure, f"{title} (left), and errors, predicted - measured (right)")
     return figure
 
 
 def pressure_figure(points: ForceSeries, nominal_label: str = "URDF") -> Figure:
-    """As `force_figure`, of centres of pressure from the base link's origin in the place of forces."""
-    rows = {0: ("along the base's x axis", "m"), 1: ("along its y axis", "m")}
-    return _figure(points, rows, f"Centre of pressure from the base link's origin, {points.source}", nominal_label)
+    """As `force_figure`, of centres of pressure from the base link's origin instead of forces."""
+    rows = {0: ("along the base's x axis", "m"), 1: ("along the base's y axis", "m")}
+    return _figure(points, rows, f"Centre of pressure from the base link's origin: {points.source}", nominal_label)
 
 
 def _from_its_start(series: ForceSeries) -> tuple[ForceSeries, str]:
@@ -136,21 +161,21 @@ def _from_its_start(series: ForceSeries) -> tuple[ForceSeries, str]:
     return replace(series, time=series.time - series.time[0]), " since the first sample"
 
 
-def _draw_errors(axis: Axes, series: ForceSeries, row: int, thin: _Thinned, unit: str) -> None:
+def _draw_errors(axis: Axes, series: ForceSeries, row: int, thin: _Thinned, unit: str, nominal_label: str) -> None:
     """Errors of both predictions; on the scale of the readings' noise, two standard deviations, where it is known."""
     nominal, identified = (x[:, row] - series.measured[:, row] for x in (series.nominal, series.identified))
-    text = ""
+    text = f"rms error: {nominal_label} {_rms(nominal):.3g}, identified {_rms(identified):.3g}"
     if series.noise is not None and np.isfinite(series.noise[:, row]).any():
         std = series.noise[:, row]
-        label = "± 2 standard deviations of the readings' noise"
+        label = "noise of the readings, ± 2 standard deviations"
         axis.fill_between(thin.time, -2.0 * thin(std), 2.0 * thin(std), color=_NOISE, linewidth=0, label=label)
         largest = max(float(np.nanmax(np.abs(identified), initial=0.0)), float(2.0 * np.nanmax(std)))
         if largest > 0.0:
             axis.set_ylim(-_SHOWN * largest, _SHOWN * largest)
-        text = f", noise alone {_rms(std):.3g}"
+        text += f", noise {_rms(std):.3g}"
     axis.plot(thin.time, thin(nominal), color=NOMINAL_COLOR, linewidth=0.8)
     axis.plot(thin.time, thin(identified), color=IDENTIFIED_COLOR, linewidth=0.8)
-    axis.set_title(f"identified: rms {_rms(identified):.3g}{text} {unit}", loc="left", fontsize=9)
+    axis.set_title(f"{text} {unit}", loc="left", fontsize=9)
 
 
 def name_row(row: int, base_rows: int, dof_names: Sequence[str], sliding: Collection[str]) -> tuple[str, str]:
@@ -161,78 +186,35 @@ def name_row(row: int, base_rows: int, dof_names: Sequence[str], sliding: Collec
     return name, "N" if name in sliding or name.endswith((".fx", ".fy", ".fz")) else "N m"
 
 
-def _largest(
-    series: ForceSeries, dof_names: Sequence[str], base_rows: int, sliding: Collection[str]
-) -> dict[int, tuple[str, str]]:
-    """Names and units of the rows to plot, the largest by rms of the measured force."""
+def _largest(series: ForceSeries, base_rows: int) -> list[int]:
+    """The rows to plot, the largest by rms of the measured force; all of the base where no joint is known."""
     size = np.sqrt(np.nanmean(np.square(np.nan_to_num(series.measured)), axis=0))
     size[~np.isfinite(series.measured).any(axis=0)] = -1.0
-    base = [max(rows, key=lambda row: size[row]) for rows in (range(3), range(3, 6))] if base_rows else []
-    base = [row for row in base if size[row] >= 0.0]
     joints = sorted((row for row in range(base_rows, len(size)) if size[row] >= 0.0), key=lambda row: -size[row])
-    shown = base + sorted(joints[: _MOST_ROWS - len(base)])
-    return {row: name_row(row, base_rows, dof_names, sliding) for row in shown}
-
-
-@dataclass(frozen=True)
-class LogForces:
-    """Forces in the rows of the fit, from the first to the last sample of a log.
-
-    Attributes:
-        projected: what no unmeasured force reaches; its noise is that of the fit's weights.
-        states: names of the contact states.
-        state: (N,), number of each sample's.
-        bandwidth: up to which frequency there is noise [Hz].
-    """
-
-    projected: ForceSeries
-    states: tuple[str, ...]
-    state: np.ndarray
-    bandwidth: float
-
-
-def rows_figure(
-    forces: LogForces,
-    dof_names: Sequence[str],
-    base_rows: int,
-    sliding: Collection[str] = (),
-    nominal_label: str = "URDF",
-) -> Figure:
-    """As `force_figure`, in the rows of the fit over the whole log; colours behind them are contact states."""
-    series = replace(forces.projected, time=forces.projected.time - forces.projected.time[0])
-    names = _largest(series, dof_names, base_rows, sliding)
-    spans = _spans(series.time, forces.state)
-    lasted = [sum(end - start for start, end, number in spans if number == k) for k in range(len(forces.states))]
-    colored = np.argsort(lasted)[::-1][1:].tolist()  # the longest stays white
-    colors = {k: CATEGORY_COLORS[place % len(CATEGORY_COLORS)] for place, k in enumerate(colored)}
-    patches = [Patch(color=color, alpha=0.25, label=forces.states[k]) for k, color in colors.items()]
-    figure = _figure(series, names, f"Rows of the fit, {series.source}", nominal_label, states=patches[:_NAMED_STATES])
-    for state, color in colors.items():
-        stays = [(start, end - start) for start, end, number in spans if number == state]
-        for axis in figure.axes:
-            style: dict[str, Any] = {"color": color, "alpha": 0.25, "linewidth": 0.0, "zorder": 0}
-            axis.broken_barh(stays, (0.0, 1.0), transform=axis.get_xaxis_transform(), **style)
-    return figure
+    base = list(range(base_rows))
+    if base and joints:
+        base = [max(rows, key=lambda row: size[row]) for rows in (range(3), range(3, 6))]
+    base = [row for row in base if size[row] >= 0.0]
+    return base + sorted(joints[: _MOST_ROWS - len(base)])
 
 
 @matplotlib.rc_context(STYLE)
 def spectrum_figure(
-    forces: LogForces,
+    series: ForceSeries,
     dof_names: Sequence[str],
     base_rows: int,
     sliding: Collection[str] = (),
     nominal_label: str = "URDF",
 ) -> Figure:
-    """Amplitude densities of the errors in the rows of the fit, and that of the readings' noise."""
-    series = forces.projected
-    names = _largest(series, dof_names, base_rows, sliding)
-    spectra = {row: _spectrum(series, row, series.time - series.time[0], forces.bandwidth) for row in names}
+    """Amplitude densities of the errors, and that of the readings' noise."""
+    names = {row: name_row(row, base_rows, dof_names, sliding) for row in _largest(series, base_rows)}
+    spectra = {row: _spectrum(series, row, series.time - series.time[0]) for row in names}
     shown = {row: spectrum for row, spectrum in spectra.items() if spectrum is not None}
     rows = -(-max(len(shown), 1) // 3)
-    size = 12.0, 2.2 * rows + 0.8
+    size = WIDTH, 2.2 * rows + 0.8
     if not shown:
         figure = Figure(figsize=size)
-        set_headline(figure, "Residuals by frequency: the log has no segment that is long enough")
+        set_headline(figure, "Errors by frequency: the log has no segment that is long enough")
         return figure
     scales = {"xscale": "log", "yscale": "log"}
     figure, grid = draw_panels(rows, min(len(shown), 3), size, bottom=0.75, down=0.7, subplot_kw=scales)
@@ -244,7 +226,7 @@ def spectrum_figure(
         ):
             axis.plot(spectrum.frequency, density, color=color, linewidth=1.2, label=label)
         if spectrum.noise is not None:
-            band = [spectrum.frequency[0], forces.bandwidth]
+            band = [spectrum.frequency[0], series.bandwidth]
             axis.plot(band, [spectrum.noise] * 2, "--", color=NOISE_COLOR, label="noise of the readings")
         name, unit = names[row]
         axis.set_title(f"{name} [{unit}/√Hz]", loc="left", fontsize=9)
@@ -254,8 +236,9 @@ def spectrum_figure(
     for axis in axes[len(shown) :]:
         axis.remove()
     figure.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncols=3)
-    title = f"Residuals by frequency in the rows of the fit, {series.source}: above the noise lies what the model lacks"
-    set_headline(figure, title)
+    noise = any(spectrum.noise is not None for spectrum in shown.values())
+    remark = "; where they are above the noise, the model lacks something" if noise else ""
+    set_headline(figure, f"Errors by frequency: {series.source}{remark}")
     return figure
 
 
@@ -281,6 +264,11 @@ class _Thinned:
         self._starts = starts[self._filled]
         width = edges[1] - edges[0]
         self.time = (edges[:-1, None] + width * np.array([0.25, 0.75])).ravel()
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether samples are missing."""
+        return len(self._gaps) > 0
 
     def __call__(self, values: Array) -> Array:
         """The points of a series (N,): of each bin the least and the largest, in the order in which it goes."""
@@ -317,18 +305,18 @@ class _Spectrum:
     noise: float | None
 
 
-def _spectrum(series: ForceSeries, row: int, time: Array, bandwidth: float) -> _Spectrum | None:
+def _spectrum(series: ForceSeries, row: int, time: Array) -> _Spectrum | None:
     """Amplitude densities in the longest segment without gaps; None if it is short."""
     errors = np.stack([series.nominal[:, row], series.identified[:, row]]) - series.measured[:, row]
     segment = _longest_segment(time, np.asarray(np.isfinite(errors).all(axis=0)))
     count = segment.stop - segment.start
-    if count < _SHORTEST or not bandwidth > 0.0:
+    if count < _SHORTEST or not series.bandwidth > 0.0:
         return None
     rate = (count - 1) / (time[segment.stop - 1] - time[segment.start])
     window = int(np.clip(count // 4, _SHORTEST, _LONGEST))
     frequency, density = import_signal().welch(errors[:, segment], rate, nperseg=window)
-    shown = (frequency > 0.0) & (frequency <= _BEYOND * bandwidth)
-    noise = None if series.noise is None else _rms(series.noise[segment, row]) / float(np.sqrt(bandwidth))
+    shown = (frequency > 0.0) & (frequency <= _BEYOND * series.bandwidth)
+    noise = None if series.noise is None else _rms(series.noise[segment, row]) / float(np.sqrt(series.bandwidth))
     nominal, identified = np.sqrt(density[:, shown])
     return _Spectrum(frequency[shown], nominal, identified, noise if noise and np.isfinite(noise) else None)
 

@@ -16,10 +16,9 @@ from torchid.parameters import PARAMETERS
 from torchid.report.figures import INTERVAL
 
 FIGURES = {
-    "forces": "generalized forces over time, measured and predicted",
+    "forces": "forces or joint torques over time, measured and predicted",
     "pressure": "centre of pressure over time, measured and predicted",
-    "rows": "rows of the fit over time, measured and predicted",
-    "spectra": "amplitude spectra of the errors, against the noise",
+    "spectra": "errors by frequency, against the noise",
     "errors": "errors before and after by group of forces",
     "parameters": "mass, first moment, inertia and friction of each body",
     "identifiability": "share of the data in each parameter",
