@@ -27,6 +27,12 @@ def browser_programs() -> tuple[str, str] | None:
     return None if browser is None or driver is None else (browser, driver)
 
 
+def resize(driver: Any, width: int) -> None:
+    """Give a browser a width [pixels], that of a telephone below 500."""
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+
+
 @contextmanager
 def opened(page: Path, profile: Path, width: int = 1280) -> Iterator[Any]:
     """The driver of a browser that has opened a page."""
@@ -42,8 +48,7 @@ def opened(page: Path, profile: Path, width: int = 1280) -> Iterator[Any]:
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=Service(programs[1]))
     try:
-        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
-        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        resize(driver, width)
         driver.get(page.resolve().as_uri())
         yield driver
     finally:

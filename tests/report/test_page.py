@@ -7,14 +7,17 @@ import html
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import run_figures
 import yaml
 from demo import shortened_demo
-from pages import browser_programs, opened
+from pages import browser_programs, opened, resize
 
 from torchid.boundary import run_guarded
 from torchid.cli import main
@@ -128,7 +131,6 @@ def test_a_run_writes_its_page_with_figures_that_a_browser_shows(
 
 
 MEGABYTE = 1_000_000
-WIDTH_PX = 390  # of a telephone
 
 
 def test_it_is_one_file_of_less_than_5_megabytes_that_asks_nobody_for_more(page: str) -> None:
@@ -141,12 +143,35 @@ def test_it_is_one_file_of_less_than_5_megabytes_that_asks_nobody_for_more(page:
     assert "default-src 'none'" in own
 
 
+@pytest.fixture(scope="module")
+def browser(run: Path, page: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """It has opened the page."""
+    assert page
+    with opened(run / PAGE, tmp_path_factory.mktemp("profile")) as driver:
+        yield driver
+
+
+def brightness(color: str) -> float:
+    """Of a computed style, 0 to 1."""
+    return float(np.mean([int(x) for x in re.findall(r"\d+", color)[:3]])) / 255.0
+
+
 @pytest.mark.slow("starts a browser")
 @pytest.mark.skipif(browser_programs() is None, reason="neither Chromium nor Chrome with chromedriver is installed")
-def test_a_browser_shows_all_figures_within_its_width(page: str, run: Path, tmp_path: Path) -> None:
-    with opened(run / PAGE, tmp_path / "profile", WIDTH_PX) as browser:
-        assert not [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
-        loaded = "return [...document.images].filter(image => image.complete && image.naturalWidth > 0).length"
-        assert browser.execute_script(loaded) == page.count("<img ")
-        assert browser.execute_script("return document.documentElement.scrollWidth") <= WIDTH_PX
-        assert browser.execute_script("return window.hacked ?? null") is None
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 400])
+def test_a_browser_shows_all_figures_within_its_width(browser: Any, page: str, width: int, scheme: str) -> None:
+    resize(browser, width)
+    features = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    browser.refresh()
+    assert not browser.get_log("browser")
+    loaded = "return [...document.images].filter(image => image.complete && image.naturalWidth > 0).length"
+    assert browser.execute_script(loaded) == page.count("<img ")
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+    assert browser.execute_script("return window.hacked ?? null") is None
+    style = "const style = getComputedStyle(document.querySelector({!r})); return style.{}"
+    paper = brightness(browser.execute_script(style.format("body", "backgroundColor")))
+    assert (paper < 0.2) == (scheme == "dark")
+    for name in ("p", "th", "td", "a", "dt", "summary"):
+        assert abs(brightness(browser.execute_script(style.format(name, "color"))) - paper) > 0.4, name
