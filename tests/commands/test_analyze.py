@@ -76,7 +76,7 @@ def test_the_folder_holds_answers_words_and_pictures(
     with_logs: tuple[Path, dict[str, Any]], without_logs: tuple[Path, dict[str, Any]]
 ) -> None:
     always = {"analysis.json", "base_parameters.txt", "config.yaml", "manifest.json"}
-    assert set(files_in(with_logs[0])) == always | {"sensors-logs.png", "accuracy.png"}
+    assert set(files_in(with_logs[0])) == always | {"sensors-logs.png"}
     assert set(files_in(without_logs[0])) == always | {"sensors-stand.png", "sensors-trot.png"}
     words = (with_logs[0] / "base_parameters.txt").read_text()
     assert max(map(len, words.splitlines())) <= 100

@@ -24,7 +24,7 @@ def test_figures_for_print_come_from_all_commands_and_tensorboard_keeps_its_pict
     assert main(["replay", str(run), "--log", str(log), "--output", str(tmp_path / "replay")]) == 0
     assert main(["analyze", experiment, f"output={tmp_path / 'other'}", *given]) == 0
     written = list(tmp_path.rglob("*.pdf"))
-    assert {path.stem for path in written} == {*OF_A_RUN, "drift", "sensors-logs", "accuracy"}
+    assert {path.stem for path in written} == {*OF_A_RUN, "drift", "sensors-logs"}
     assert len(written) == len(OF_A_RUN) + 6
     for path in written:
         assert path.read_bytes().startswith(b"%PDF-1.")

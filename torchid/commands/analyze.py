@@ -34,7 +34,6 @@ from torchid.reading.log_reader import LogReader, check_read
 from torchid.report.analysis import (
     ALL_OF,
     SetAccuracy,
-    accuracy_figure,
     base_parameters_document,
     base_parameters_text,
     observability_document,
@@ -446,8 +445,6 @@ def _write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -
         which = "planned" if scenario.proposed is None else "proposed"
         texts.append(base_parameters_text(f"{scenario.name}, {which} sensors", scenario.base, names))
         figures[f"sensors-{scenario.name}"] = _picture(setup, scenario)
-    if any(accuracy.measured is not None for accuracy in analysis.accuracies.values()):
-        figures["accuracy"] = accuracy_figure(analysis.accuracies)
     with during("writing", output), new_folder(output, overwrite, ANALYSIS) as folder:
         (folder / "config.yaml").write_text(dump_config(setup.config))
         write_json(folder / "analysis.json", analysis.to_dict())
@@ -473,5 +470,5 @@ def _picture(setup: RobotSetup, scenario: ScenarioAnalysis) -> Figure:
         len({channel for candidate in sensors for channel in candidate.readings})
         for sensors in (plan.chosen, plan.problem.candidates)
     )
-    title = f"{scenario.name}: {channels} of {possible} sensor channels"
+    title = f"Sensors for {scenario.name}: {channels} of {possible} channels"
     return tree_figure(title, robot, used, measured, wrenches, constrained)

@@ -1,4 +1,4 @@
-"""Results of `torchid analyze`: tables, text, `analysis.json`, and the figure of accuracy."""
+"""Results of `torchid analyze`: tables, text and `analysis.json`."""
 
 from __future__ import annotations
 
@@ -7,17 +7,14 @@ from dataclasses import dataclass
 from textwrap import wrap
 from typing import Any
 
-import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 from rich.table import Table
 
 from torchid.errors import format_count, format_percent
 from torchid.fitting.left_out import Evidence
 from torchid.identifiability.base_parameters import BaseParameters, format_base_parameters, unobservable_parameters
 from torchid.problem import Metrics
-from torchid.problem.metrics import ROW_GROUPS, group_name
-from torchid.report.figure_style import MEASURED_COLOR, STYLE, label_decades, label_ticks
+from torchid.problem.metrics import ROW_GROUPS
 from torchid.report.tables import make_table
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.observability import BaseObservability, Candidate, LostBase, PostureSummary
@@ -308,23 +305,3 @@ def contradicting_messages(without: Mapping[str, Evidence]) -> list[str]:
     smaller = [(name, format_percent(-np.expm1(0.5 * loss))) for _, loss, name in worse]
     advice = "check gain, axes and offset: torchid check"
     return [f"without {name} errors of the others are {share} % smaller; {advice}" for name, share in smaller]
-
-
-@matplotlib.rc_context(STYLE)
-def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
-    """One panel per group of rows that the logs give, with the sensor sets side by side on a logarithmic scale."""
-    measured = {name: accuracy.measured.rms for name, accuracy in sets.items() if accuracy.measured is not None}
-    groups = [group for group in ROW_GROUPS if any(rms[group] is not None for rms in measured.values())]
-    figure = Figure(figsize=(2.6 * max(len(groups), 2) + 0.6, 3.8), layout="constrained")
-    axes = figure.subplots(1, len(groups), squeeze=False)[0]
-    index = np.arange(len(measured))
-    for axis, group in zip(axes, groups, strict=True):
-        heights = [np.nan if (x := rms[group]) is None else x for rms in measured.values()]
-        axis.plot(index, heights, "D", color=MEASURED_COLOR, markersize=7)
-        axis.set_yscale("log")
-        axis.margins(x=0.3 / max(len(measured) - 1, 1), y=0.15)
-        label_decades(axis.yaxis)
-        label_ticks(axis.xaxis, index, list(measured), rotation=40, ha="right")
-        axis.set_title(group_name(group), loc="left", fontsize=9)
-        axis.set_ylabel(f"rms error {ROW_GROUPS[group][ROW_GROUPS[group].index('[') :]}")
-    return figure
