@@ -1,4 +1,4 @@
-"""Draw the figures of docs/concepts.md, all of the demo's quadruped.
+"""Draw the figures of docs/concepts.md and of the README, all of the demo's quadruped.
 
     python scripts/concept_figures.py                   # into docs
     python scripts/concept_figures.py --folder figures
@@ -9,6 +9,7 @@ The demo is identified as its experiment file says; the friction of its simulati
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -18,7 +19,7 @@ from matplotlib.figure import Figure
 import torchid
 from torchid.boundary import run_guarded
 from torchid.commands.run_folder import Identification
-from torchid.parameters import PARAMETERS, PER_BODY, Array
+from torchid.parameters import GRAVITY, PARAMETERS, PER_BODY, Array
 from torchid.problem.metrics import force_series, null_space_part
 from torchid.reading.log_reader import LogReader
 from torchid.report.figure_style import (
@@ -30,6 +31,7 @@ from torchid.report.figure_style import (
     save_figures,
 )
 from torchid.report.figures import INTERVAL, identifiability_figure
+from torchid.report.forces import ForceSeries, force_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "torchid" / "demo" / "quadruped.yaml"
@@ -45,17 +47,33 @@ def main() -> int:
 
 
 def draw(folder: Path) -> None:
-    """Write the three figures."""
+    """Write the figures."""
     run = torchid.identify(DEMO, output=None)
     robot = run.experiment.robot
+    assert run.forces is not None
     with matplotlib.rc_context(STYLE):
         figures = {
             "concept_projection": projection_figure(*unmeasured_forces(run)),
             "concept_verdicts": identifiability_figure(robot.body_names, run.estimate),
             "concept_intervals": interval_figure(run),
+            "demo_forces": readme_figure(run, run.forces),
         }
     folder.mkdir(parents=True, exist_ok=True)
     save_figures(figures, folder, "png")
+
+
+def readme_figure(run: Identification, forces: ForceSeries) -> Figure:
+    """Forces of the base and of a joint, and why the error of the base force leaves the band of the noise."""
+    robot = run.experiment.robot
+    rows = (2, robot.base_rows + robot.joint_names.index("front_left_hip"))
+    forces = replace(forces, states=(), state=None)
+    figure = force_figure(forces, robot.dof_names, robot.base_rows, robot.sliding, robot.format, rows)
+    mean = float(np.nanmean(forces.identified[:, 2] - forces.measured[:, 2]))
+    error = GRAVITY * run.mass.standard_error
+    text = f"mean {mean:.2g} N; total mass known to ± {run.mass.standard_error:.2g} kg, so to ± {error:.2g} N"
+    axis = figure.axes[1]
+    axis.set_title(f"{axis.get_title(loc='left')}\n{text}", loc="left", fontsize=9)
+    return figure
 
 
 def unmeasured_forces(run: Identification) -> tuple[Array, Array, Array]:

@@ -53,6 +53,6 @@ def test_every_figure_of_the_page_is_there_and_is_drawn(
     script("concept_figures").draw(tmp_path)
     assert files == [(DEMO / "quadruped.yaml", None)]
     drawn = {path.name for path in tmp_path.iterdir()}
-    assert len(drawn) == 3
-    page = (ROOT / "docs" / "concepts.md").read_text()
-    assert all(f"({name})" in page and (ROOT / "docs" / name).is_file() for name in drawn)
+    assert len(drawn) == 4
+    pages = (ROOT / "docs" / "concepts.md").read_text() + (ROOT / "README.md").read_text().replace("(docs/", "(")
+    assert all(f"({name})" in pages and (ROOT / "docs" / name).is_file() for name in drawn)

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from physical import random_bodies
 
-from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED
+from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, UNOBSERVABLE
 from torchid.parameters import PARAMETERS
 from torchid.report.figures import parameter_figure
 
@@ -81,3 +81,19 @@ def test_bodies_that_cannot_exist_and_negative_friction_have_a_cross() -> None:
     assert crosses["mass"] == [-1.0]
     assert crosses["viscous"] == [-0.1]
     assert not crosses["Coulomb"]
+
+
+def test_what_the_data_say_nothing_of_is_not_shown() -> None:
+    """A massless body with friction that no sensor sees, and friction of all joints."""
+    nominal = random_bodies(np.random.default_rng(0), 3)
+    verdict = np.full(nominal.shape, COMBINED, dtype=object)
+    verdict[:, [COULOMB, VISCOUS]] = UNOBSERVABLE
+    verdict[1, :COULOMB] = FIXED
+    estimate: Any = SimpleNamespace(phi=nominal.ravel(), standard_error=np.ones(nominal.size), verdict=verdict.ravel())
+    figure = parameter_figure(["trunk", "massless", "leg"], nominal, estimate)
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["trunk", "leg"]
+    assert not any("friction" in axis.get_xlabel() for axis in figure.axes)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "URDF",
+        "known only in sums, or mostly the URDF's",
+    ]

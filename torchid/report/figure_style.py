@@ -29,6 +29,9 @@ NOISE_COLOR = "#8c8c8c"
 CATEGORY_COLORS = ("#56b4e9", "#f0e442", "#009e73", "#cc79a7", "#e69f00", NOISE_COLOR, IDENTIFIED_COLOR, NOMINAL_COLOR)
 """Of things that have no order; then again from the first."""
 
+WIDTH = 12.0
+"""Of figures [inches]: one width for all, so that a page shows all letters in one size."""
+
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "text.parse_math": False,  # names may hold dollar signs

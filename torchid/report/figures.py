@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from textwrap import fill
 from typing import Any
@@ -13,27 +12,27 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Patch
 
 from torchid import parameters
 from torchid.errors import format_percent
 from torchid.estimators import Estimate
-from torchid.estimators.least_squares import FIXED, IDENTIFIED
+from torchid.estimators.least_squares import FIXED, IDENTIFIED, UNOBSERVABLE
 from torchid.fitting.fit import Comparison
 from torchid.fitting.left_out import RidgeChoice
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.logs.time_range import log_title
 from torchid.parameters import INERTIAL, PARAMETERS, PER_BODY, WRENCH_COMPONENTS, Array
 from torchid.problem import Metrics
-from torchid.problem.metrics import ERROR_GROUPS, group_name
+from torchid.problem.metrics import ERROR_GROUPS, WHITENED, group_name
 from torchid.report.figure_style import (
     CATEGORY_COLORS,
     IDENTIFIED_COLOR,
     MEASURED_COLOR,
     NOMINAL_COLOR,
     STYLE,
+    WIDTH,
     decade,
     label_decades,
     label_ticks,
@@ -63,10 +62,10 @@ def parameter_figure(
     kinds: Collection[str] = ("revolute", "prismatic"),
     nominal_label: str = "URDF",
 ) -> Figure:
-    """Mass, first moment, inertia and friction of every body with a free parameter.
+    """Mass, first moment, inertia and friction of the bodies that the data say something about.
 
     Filled points are identified and have their 95 % intervals; hollow ones are known only in sums with others, or
-    mostly the URDF's. Negative values, and names of bodies that cannot exist, have a cross.
+    mostly the URDF's. Negative values, and names of bodies that are not physically consistent, have a cross.
 
     Args:
         body_names: of all bodies.
@@ -76,12 +75,12 @@ def parameter_figure(
         nominal_label: what the nominal parameters are from.
     """
     verdict = estimate.verdict.reshape(-1, PER_BODY)
-    shown = np.flatnonzero((verdict != FIXED).any(axis=1))
+    shown, columns = _determined(verdict)
     before, after, errors = (x.reshape(-1, PER_BODY)[shown] for x in (nominal, estimate.phi, estimate.standard_error))
     known = (verdict[shown] == IDENTIFIED) & np.isfinite(errors)
-    single = [name for name in _SINGLE if (verdict[shown][:, PARAMETERS.index(name)] != FIXED).any()]
+    single = [name for name in _SINGLE if PARAMETERS.index(name) in columns]
     titles = [_title("m", kinds), *_DERIVED, *(_title(name, kinds) for name in single if name != "m")]
-    figure = Figure(figsize=(1.9 + 2.3 * len(titles), 0.24 * len(shown) + 1.7), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 0.24 * len(shown) + 1.7), layout="constrained")
     axes = dict(zip(titles, figure.subplots(1, len(titles), sharey=True, squeeze=False)[0], strict=True))
     for name in single:
         k = PARAMETERS.index(name)
@@ -98,10 +97,23 @@ def parameter_figure(
     impossible |= parameters.consistency_margin(after) < parameters.POSSIBLE_MARGIN
     names = [(_IMPOSSIBLE if bad else "") + body_names[int(k)] for k, bad in zip(shown, impossible, strict=True)]
     first = axes[titles[0]]
-    label_ticks(first.yaxis, range(len(shown)), names, fontsize=7)
+    label_ticks(first.yaxis, range(len(shown)), names)
     first.set_ylim(len(shown) - 0.4, -0.6)
-    figure.legend(handles=_legend(first, nominal_label, bool(impossible.any())), loc="outside upper right", ncols=4)
+    figure.suptitle("Parameters of the bodies", x=0.01, ha="left")
+    handles = _legend(first, nominal_label, bool(known.any()), bool(impossible.any()))
+    figure.legend(handles=handles, loc="outside upper right", ncols=4)
     return figure
+
+
+def _determined(verdict: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bodies, and columns of parameters, that the data say something about; all if they say nothing.
+
+    `verdict`: (L, 12).
+    """
+    seen = ~np.isin(verdict, (FIXED, UNOBSERVABLE))
+    if not seen.any():
+        seen = verdict != FIXED
+    return np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
 
 
 def _title(name: str, kinds: Collection[str]) -> str:
@@ -124,19 +136,21 @@ def _draw(axis: Axes, before: Array, after: Array, known: np.ndarray, bars: Arra
     axis.plot(after[negative], rows[negative] + 0.16, "X", color=MEASURED_COLOR, markersize=6, zorder=3)
 
 
-def _legend(axis: Axes, nominal_label: str, impossible: bool) -> list[matplotlib.artist.Artist]:
+def _legend(axis: Axes, nominal_label: str, known: bool, impossible: bool) -> list[matplotlib.artist.Artist]:
     """Handles with labels, drawn outside of what is seen."""
-    kinds = [("D", NOMINAL_COLOR, "none", nominal_label), ("o", IDENTIFIED_COLOR, IDENTIFIED_COLOR, "identified, 95 %")]
-    kinds.append(("o", IDENTIFIED_COLOR, "white", f"known in sums, or the {nominal_label}'s"))
+    kinds = [("D", NOMINAL_COLOR, "none", nominal_label)]
+    if known:
+        kinds.append(("o", IDENTIFIED_COLOR, IDENTIFIED_COLOR, "identified, 95 % interval"))
+    kinds.append(("o", IDENTIFIED_COLOR, "white", f"known only in sums, or mostly the {nominal_label}'s"))
     if impossible:
-        kinds.append(("X", MEASURED_COLOR, MEASURED_COLOR, "cannot exist"))
+        kinds.append(("X", MEASURED_COLOR, MEASURED_COLOR, "not physically consistent"))
     return [
         axis.plot([], [], mark, color=color, markerfacecolor=face, label=label)[0] for mark, color, face, label in kinds
     ]
 
 
 _MAX_PANEL_ROWS = 40  # `parameters.json` has all
-_MAX_ERROR_RATIO = 4  # longest error bar that is whole, over the largest value
+_MAX_SIZE_RATIO = 4  # end of the axis, over the median of the ends of the intervals
 _ENDLESS = 1e3  # longest error bar of all, over this
 _MARGIN = 0.05  # beside the bars, as a share of the panel
 _LANES = 5  # vertical offsets of logs in one row
@@ -155,7 +169,7 @@ def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
         for unit in units
     }
     height = 1.2 + 0.24 * sum(map(len, rows.values())) + 0.6 * len(units)
-    figure = Figure(figsize=(9.0, max(height, 2.4)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, max(height, 2.4)), layout="constrained")
     heights = [len(rows[unit]) + 1 for unit in units]
     axes = figure.subplots(len(units), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
     chosen = [color for color in CATEGORY_COLORS[::-1] if color != NOMINAL_COLOR]
@@ -164,9 +178,10 @@ def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
         in_panel = [x for x in extras if x.extra.unit == unit and x.extra.label in rows[unit]]
         _draw_panel(axis, in_panel, rows[unit], colors)
         kinds = {x.extra.what for x in in_panel}
-        named = f"{kinds.pop()} " if len(kinds) == 1 else ""
-        axis.set_xlabel(f"{named}[{unit.replace('^2', '²')}]" if unit != "1" else "scale less 1 [1]")
-    axes[0, 0].set_title("95 % intervals; hollow: confounded with other parameters", loc="left", fontsize=8)
+        named = f"{kinds.pop().replace('_', ' ')} " if len(kinds) == 1 else ""
+        axis.set_xlabel(f"{named}[{unit.replace('^2', '²')}]" if unit != "1" else "scale - 1 [1]")
+    title = "Sensors and actuators: 95 % intervals; hollow: confounded with other parameters"
+    figure.suptitle(title, x=0.01, ha="left")
     # made by hand: a log need not have a point in every panel, nor a filled one
     keys = [Line2D([], [], marker="o", linestyle="", color=color) for color in colors.values()]
     names = [log_title(log) or "all logs" for log in logs]
@@ -178,47 +193,34 @@ def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
 def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str], colors: Mapping[str, str]) -> None:
     """Values with their intervals; the logs of a row have vertical offsets around its middle.
 
-    Long intervals leave the panel: a bar that ends within it ends where the interval does.
+    The axis is cut off where few long intervals would leave the others no room; a text has each value beyond it.
     """
-    longest = _MAX_ERROR_RATIO * max(abs(x.value) for x in extras) or 1.0
-    bars = [(x.value, INTERVAL * x.standard_error) for x in extras]
-    ends = [end for value, error in bars for end in (value - min(error, longest), value + min(error, longest))]
+    sizes = [abs(x.value) + INTERVAL * x.standard_error for x in extras if x.separable]
+    sizes = [size for size in sizes if np.isfinite(size)] or [abs(x.value) for x in extras]
+    reach = _MAX_SIZE_RATIO * float(np.median(sizes)) or 1.0
     for number, log in enumerate(logs := [log for log in colors if any(x.log == log for x in extras)]):
         points = [x for x in extras if x.log == log]
         offset = 0.15 * (number % _LANES - (min(len(logs), _LANES) - 1) / 2)
         values = [x.value for x in points]
         index = [rows.index(x.extra.label) + offset for x in points]
-        error = [min(INTERVAL * x.standard_error, _ENDLESS * longest) for x in points]
+        error = [min(INTERVAL * x.standard_error, _ENDLESS * reach) for x in points]
         axis.errorbar(values, index, xerr=error, fmt="none", ecolor=colors[log], elinewidth=1.0)
         faces = [colors[log] if x.separable else "white" for x in points]
         axis.scatter(values, index, c=faces, edgecolors=colors[log], s=22, zorder=3)
-    axis.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
-    label_ticks(axis.yaxis, range(len(rows)), rows, fontsize=8)
-    axis.set_ylim(len(rows) - 0.5, -0.5)
-    margin = _MARGIN * (max(*ends, 0.0) - min(*ends, 0.0))
-    axis.set_xlim(min(*ends, 0.0) - margin, max(*ends, 0.0) + margin)
-    _leave_room(axis, extras, rows)
-
-
-def _leave_room(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str]) -> None:
-    """Cut the axis off where confounded values would leave those that are known no room; an arrow has what is cut."""
-    bars = [(x.value, INTERVAL * x.standard_error) for x in extras if x.separable and math.isfinite(x.standard_error)]
-    low = min((v - e for v, e in bars), default=0.0)
-    high = max((v + e for v, e in bars), default=0.0)
-    low = min(low, 0.0)
-    high = max(high, 0.0)
-    left, right = axis.get_xlim()
-    if not high > low or right - left <= _MAX_ERROR_RATIO * (high - low):
-        return
-    margin = 0.3 * (high - low)
+        for value, place in zip(values, index, strict=True):
+            if abs(value) > reach:
+                right = value > 0.0
+                text = f"{value:.3g} ▸" if right else f"◂ {value:.3g}"
+                style: dict[str, Any] = {"transform": axis.get_yaxis_transform(), "va": "bottom", "fontsize": 8}
+                axis.text(0.995 if right else 0.005, place, text, ha="right" if right else "left", **style)
+    ends = np.array([(x.value - INTERVAL * x.standard_error, x.value + INTERVAL * x.standard_error) for x in extras])
+    low = max(float(ends.min(initial=0.0)), -reach)
+    high = min(float(ends.max(initial=0.0)), reach)
+    margin = _MARGIN * (high - low) or _MARGIN
     axis.set_xlim(low - margin, high + margin)
-    for x in extras:
-        if not low - margin <= x.value <= high + margin:
-            left_side = x.value < low
-            text = f"◂ {x.value:.2g}" if left_side else f"{x.value:.2g} ▸"
-            place = 0.005 if left_side else 0.995, rows.index(x.extra.label)
-            where = axis.get_yaxis_transform()
-            axis.text(*place, text, transform=where, ha="left" if left_side else "right", va="bottom", fontsize=7)
+    axis.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
+    label_ticks(axis.yaxis, range(len(rows)), rows)
+    axis.set_ylim(len(rows) - 0.5, -0.5)
 
 
 # ----------------------------------------------------------------------------------------------- ellipsoids of inertia
@@ -226,7 +228,7 @@ def _leave_room(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str]
 
 @matplotlib.rc_context(STYLE)
 def inertia_figure(robot: Robot, phi: Array) -> Figure:
-    """Uniform ellipsoids with the inertia of the bodies, from the side and from the front of the base.
+    """Uniform ellipsoids with the inertia of the bodies, in the two planes of the base that have the robot's length.
 
     At zero joint positions; lines join the origins of the link frames.
 
@@ -237,10 +239,11 @@ def inertia_figure(robot: Robot, phi: Array) -> Figure:
     poses = robot.link_poses(torch.zeros(1, robot.n, dtype=torch.float64))
     frames = [poses[name][0].numpy() for name in robot.body_names]
     kinds = ((robot.nominal, NOMINAL_COLOR, robot.format), (phi, IDENTIFIED_COLOR, "identified"))
-    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
-    views = ((0, "from the side"), (1, "from the front"))
-    for axis, (across, title) in zip(figure.subplots(1, len(views)), views, strict=True):
-        plane = [across, 2]
+    figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
+    longest = int(np.argmax(np.ptp([frame[:3, 3] for frame in frames], axis=0)))
+    others = [k for k in (2, 1, 0) if k != longest]
+    for other, axis in zip(others, figure.subplots(1, 2), strict=True):
+        plane = [other, longest] if longest else [longest, other]
         for bodies, color, _ in kinds:
             for body, frame in zip(bodies, frames, strict=True):
                 ellipsoid = equivalent_ellipsoid(body)
@@ -250,14 +253,14 @@ def inertia_figure(robot: Robot, phi: Array) -> Figure:
             ends = np.array([frames[k][plane, 3] for k in (body, max(link.parent, 0))])
             axis.plot(*ends.T, color=MEASURED_COLOR, linewidth=0.8)
         axis.set_aspect("equal", adjustable="datalim")
-        axis.set_title(title, loc="left", fontsize=9)
-        axis.set_xlabel(f"{'xy'[across]} [m]")
-        axis.set_ylabel("z [m]")
+        axis.set_xlabel(f"{'xyz'[plane[0]]} [m]")
+        axis.set_ylabel(f"{'xyz'[plane[1]]} [m]")
     handles = [Patch(facecolor=color, alpha=0.4, edgecolor=color, label=label) for _, color, label in kinds]
     figure.legend(handles=handles, loc="outside upper right", ncols=2)
     bad = [name for name, x in zip(robot.body_names, phi, strict=True) if x.any() and equivalent_ellipsoid(x) is None]
-    missing = f"\nnot drawn, as no body has their inertia: {', '.join(bad)}" if bad else ""
-    figure.suptitle(f"Ellipsoids of inertia in the frame of {robot.base_link}{missing}", x=0.01, ha="left")
+    missing = f"\nnot drawn, as not physically consistent: {', '.join(bad)}" if bad else ""
+    title = f"Bodies as ellipsoids of the same mass and inertia, all joints at zero, in the frame of {robot.base_link}"
+    figure.suptitle(title + missing, x=0.01, ha="left")
     return figure
 
 
@@ -291,16 +294,17 @@ def equivalent_ellipsoid(phi: Array) -> tuple[Array, Array] | None:
     return center, axes * np.sqrt(5.0 * np.maximum(eigenvalues, 0.0) / mass)
 
 
-_FLOOR = "noise of the readings alone"
+_FLOOR = "noise of the readings"
+_GROUPS = {"nullspace": "projected torque", WHITENED: "whitened residual"}
 _MOST_BARS = 20  # of a kind of contributions
 _TORQUE = IDENTIFIED_COLOR  # colors of sensors and links in the tree
 _WRENCH = "#009e73"
 _LIMB = "#cc79a7"
 _PLAIN = "0.75"
 _LOADED = "0.3"
-_COLUMN = 2.1  # inches of a column of the tree
+_COLUMN = 2.4  # inches of a column of the tree
 _ROW = 0.3  # likewise of a row
-_LEGEND = 7.4  # likewise of its legend
+_LEGEND = 8.4  # likewise of its legend
 
 Position = tuple[float, int]
 """Column and row in the figure of a tree."""
@@ -312,7 +316,7 @@ Position = tuple[float, int]
 @matplotlib.rc_context(STYLE)
 def error_figure(sets: Mapping[str, Comparison[Metrics]], nominal_label: str = "URDF") -> Figure:
     """Relative error by group of rows, nominal (of `nominal_label`) against identified, one panel per set of logs."""
-    figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
+    figure = Figure(figsize=(max(WIDTH, 4.2 * len(sets) + 0.6), 3.2), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
         groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
@@ -324,9 +328,10 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]], nominal_label: str = "
             axis.bar_label(bars, fmt=lambda height: format_percent(height / 100.0), fontsize=8, padding=2)
         _draw_noise(axis, identified, groups)
         axis.margins(y=0.1)
-        axis.set_xticks(index, [group_name(group).replace(" ", "\n") for group in groups])
-        axis.set_title(name, loc="left")
-    axes[0].set_ylabel("rms of error / rms of measured [%]")
+        axis.set_xticks(index, [_GROUPS.get(group, group_name(group)).replace(" ", "\n", 1) for group in groups])
+        axis.set_title(f"{name} logs", loc="left", fontsize=9)
+    axes[0].set_ylabel("rms of error [% of measured rms]")
+    figure.suptitle("Errors of predicted forces", x=0.01, ha="left")
     by_label = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     labels = sorted(by_label, key=lambda label: label == _FLOOR)
     figure.legend([by_label[label] for label in labels], labels, loc="outside upper right", ncols=3)
@@ -346,37 +351,36 @@ def _draw_noise(axis: Axes, metrics: Metrics, groups: Sequence[str]) -> None:
 
 @matplotlib.rc_context(STYLE | {"axes.grid": False})
 def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Figure:
-    """Share of the data in every parameter, with the mark of its verdict, and the singular values of the problem."""
+    """A table of the share of the data in every parameter, with the mark of its verdict."""
     verdicts = estimate.verdict.reshape(-1, PER_BODY)
-    shown = np.flatnonzero((verdicts != FIXED).any(axis=1))
-    free = np.flatnonzero((verdicts != FIXED).any(axis=0))
-    share = estimate.data_share.reshape(-1, PER_BODY)[np.ix_(shown, free)]
-    apart = ConstrainedLayoutEngine(wspace=0.08)  # else the label of the colors reads as one of the other axis
-    figure = Figure(figsize=(11.0, 0.24 * len(shown) + 1.8), layout=apart)
-    left, right = figure.subplots(1, 2, width_ratios=[1.9, 1.0])
-    image = left.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    shown, columns = _determined(verdicts)
+    share = 100.0 * estimate.data_share.reshape(-1, PER_BODY)[np.ix_(shown, columns)]
+    figure = Figure(figsize=(WIDTH, 0.24 * len(shown) + 1.3), layout="constrained")
+    axis = figure.subplots()
+    axis.imshow(share, cmap="Blues", vmin=0.0, vmax=100.0, aspect="auto")
     for row, body in enumerate(shown):
-        for column, verdict in enumerate(verdicts[body, free]):
-            color = "white" if share[row, column] > 0.6 else "black"
-            left.text(column, row, MARKS[verdict], ha="center", va="center", fontsize=8, color=color, in_layout=False)
-    left.set_xticks(range(len(free)), [PARAMETERS[int(k)] for k in free], fontsize=7)
-    label_ticks(left.yaxis, range(len(shown)), [body_names[int(body)] for body in shown], fontsize=7)
-    left.set_title(marks_legend(), loc="left", fontsize=8)
-    figure.colorbar(image, ax=left, label="share of the data", pad=0.01)
-    values = estimate.singular_values
-    right.semilogy(np.arange(1, len(values) + 1), values, ".", color=IDENTIFIED_COLOR, markersize=4)
-    label_decades(right.yaxis)
-    right.axvline(estimate.rank + 0.5, color="0.5", linewidth=0.8)
-    right.set_title(f"singular values, rank {estimate.rank}", loc="left", fontsize=8)
-    right.set_xlabel("number")
-    right.set_ylabel("singular value\n[standard deviations per scale]")
-    right.grid(visible=True)
+        for column, verdict in enumerate(verdicts[body, columns]):
+            color = "white" if share[row, column] > 60.0 else "black"
+            text = f"{share[row, column]:.0f} {MARKS[verdict]}" if MARKS[verdict] else ""
+            axis.text(column, row, text, ha="center", va="center", fontsize=9, color=color, in_layout=False)
+    axis.xaxis.tick_top()
+    axis.set_xticks(range(len(columns)), [PARAMETERS[int(k)] for k in columns])
+    label_ticks(axis.yaxis, range(len(shown)), [body_names[int(body)] for body in shown])
+    axis.tick_params(length=0)
+    axis.spines[:].set_visible(False)
+    axis.set_xlabel(
+        "m: mass; mc: first moment; I: inertia about the link's origin; fc, fv: Coulomb and viscous friction"
+    )
+    title = f"How much of each parameter is known from the data, not from the prior [%]: {marks_legend()}"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
     return figure
 
 
 @matplotlib.rc_context(STYLE)
 def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]]) -> Figure:
     """Bits lost without each log, contact state or sensor, by group: pairs of name and bits, the largest first.
+
+    A bit is a standard error of one combination of parameters that doubles.
 
     Groups of one are left out if there are others.
     """
@@ -387,18 +391,23 @@ def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]]) -> Fi
         if pairs
     }
     counts = [len(pairs) for pairs in shown.values()]
-    figure = Figure(figsize=(9.0, 0.24 * sum(counts) + 0.6 * len(shown) + 0.6), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 0.24 * sum(counts) + 0.6 * len(shown) + 0.6), layout="constrained")
     axes = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[count + 0.8 for count in counts])[:, 0]
     for axis, (group, pairs) in zip(axes, shown.items(), strict=True):
         names, bits = zip(*pairs, strict=True)
         bars = axis.barh(range(len(pairs)), bits, 0.7, color=IDENTIFIED_COLOR)
-        axis.bar_label(bars, fmt="%.3g", fontsize=8, padding=2)
-        label_ticks(axis.yaxis, range(len(pairs)), [fill(name, 60) for name in names], fontsize=7)
+        axis.margins(x=0.08)
+        axis.bar_label(bars, fmt="%.3g", padding=2)
+        label_ticks(axis.yaxis, range(len(pairs)), [fill(name, 60) for name in names])
         axis.set_ylim(len(pairs) - 0.4, -0.6)
         axis.grid(visible=False, axis="y")
         hidden = len(groups[group]) - len(pairs)
-        axis.set_title(group + (f", {hidden} more not shown" if hidden else ""), loc="left", fontsize=9)
+        axis.set_title(
+            group + (f", the {len(pairs)} largest of {len(groups[group])}" if hidden else ""), loc="left", fontsize=9
+        )
     axes[-1].set_xlabel("information lost without it [bits]")
+    title = "What each part adds; 1 bit: without it, the standard error of one parameter combination doubles"
+    figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 
@@ -443,7 +452,7 @@ def tree_figure(
     axes.set(xlim=(-0.15, right + 0.95), ylim=(deepest + 0.6, -0.6))
     axes.axis("off")
     figure.suptitle(title, x=0.01, ha="left")
-    figure.legend(handles=_tree_legend(bool(robot.ft_names)), loc="outside lower left", ncols=5, fontsize=7.5)
+    figure.legend(handles=_tree_legend(bool(robot.ft_names)), loc="outside lower left", ncols=4, fontsize=8)
     return figure
 
 
@@ -506,7 +515,7 @@ def _draw_joint(
     axes.plot(x, y, "h" if joint.kind == "fixed" else "o", markersize=8 if joint.kind == "fixed" else 7, **style)
     label = joint.name if joint.mimic is None else f"{joint.name} (follows)"
     label += f": {', '.join(weld)}" if part else ""
-    _label(axes, label, position, measured, fontsize=6.5, color="black" if measured or loaded else "0.45")
+    _label(axes, label, position, measured, fontsize=8, color="black" if measured or loaded else "0.45")
 
 
 def _label(axes: Axes, text: str, position: Position, bold: bool = False, **style: Any) -> None:
@@ -520,19 +529,19 @@ def _draw_contact(axes: Axes, contact: Contact, body: Position, position: Positi
     color, face = (_WRENCH, _WRENCH) if measured else ("0.5", "white")
     axes.plot(*position, "D", color=color, markerfacecolor=face, fillstyle="left" if part else "full", markersize=8)
     components = f": {', '.join(measured)}" if part else ""
-    _label(axes, f"{contact.frame} ({contact.kind}){components}", position, bool(measured), fontsize=7)
+    _label(axes, f"{contact.frame} ({contact.kind}){components}", position, bool(measured), fontsize=8)
 
 
 def _tree_legend(welds: bool) -> list[Line2D]:
     def marker(shape: str, color: str, face: str, label: str) -> Line2D:
         return Line2D([], [], marker=shape, color=color, markerfacecolor=face, linestyle="none", label=label)
 
-    in_limbs = [marker("h", _LIMB, _LIMB, "sensor in a limb"), marker("h", "0.5", "white", "weld without")]
+    in_limbs = [marker("h", _LIMB, _LIMB, "sensor in a limb"), marker("h", "0.5", "white", "weld without sensor")]
     return [
         marker("o", _TORQUE, _TORQUE, "joint torque measured"),
-        marker("o", "0.5", "white", "not measured"),
+        marker("o", "0.5", "white", "joint torque not measured"),
         marker("D", _WRENCH, _WRENCH, "contact sensor"),
-        marker("D", "0.5", "white", "contact without"),
+        marker("D", "0.5", "white", "contact without sensor"),
         Line2D([], [], color=_LOADED, linewidth=2.2, label="constrained by contacts"),
         *(in_limbs if welds else []),
     ]
@@ -554,7 +563,7 @@ def ridge_figure(choice: RidgeChoice, nominal_label: str = "URDF") -> Figure:
     least = float(mean.min())
     within = (mean - error <= least) & (tried > 0.0)
     shown = tried > 0.0
-    figure = Figure(figsize=(6.4, 3.8), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 3.8), layout="constrained")
     axes = figure.subplots()
     axes.set_xscale("log")
     if mean.max() > _WIDE_RATIO * max(least, np.finfo(float).tiny):
@@ -566,7 +575,7 @@ def ridge_figure(choice: RidgeChoice, nominal_label: str = "URDF") -> Figure:
     (curve,) = axes.plot(tried[shown], mean[shown], "o-", color=IDENTIFIED_COLOR, markersize=4)
     line = axes.axhline(least, color="0.3", linewidth=1.0, linestyle="--")
     handles = [curve, band, line]
-    labels = ["held-out folds", "± a standard error of the difference from the least", f"least: {least:.4g}"]
+    labels = ["error", "± its standard error, as difference from the least", f"least: {least:.4g}"]
     if within.any():
         edge = np.sqrt(10.0)
         handles.append(
@@ -584,10 +593,10 @@ def ridge_figure(choice: RidgeChoice, nominal_label: str = "URDF") -> Figure:
     if axes.get_yscale() == "log":
         label_decades(axes.yaxis)
     axes.set_xlim(tried[shown].min() / 2.0, tried[shown].max() * 2.0)
-    axes.set_xlabel(f"ridge: weight of the {nominal_label} against the mean square of the rows [1]")
+    axes.set_xlabel(f"ridge: weight of the {nominal_label} [1]")
     axes.set_ylabel("mean square of whitened residuals\non held-out folds [noise²]")
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8)
-    figure.suptitle("Ridge by cross-validation", x=0.01, ha="left")
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    figure.suptitle("Ridge, chosen by cross-validation", x=0.01, ha="left")
     return figure
 
 
@@ -618,7 +627,7 @@ def drift_figure(
         nominal_label: what the robot's file is.
     """
     tall = max(0.22 * len(by_joint) + 1.4, 1.9 * len(quartiles) + 0.8)
-    figure = Figure(figsize=(11.0, tall), layout="constrained")
+    figure = Figure(figsize=(WIDTH, tall), layout="constrained")
     grid = figure.add_gridspec(len(quartiles), 2, width_ratios=(1.0, 1.1))
     for row, (name, (nominal, identified)) in enumerate(quartiles.items()):
         axis = figure.add_subplot(grid[row, 0])

@@ -21,12 +21,11 @@ from torchid.log_checks.findings import channel_names, channel_unit
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.time_range import log_title
-from torchid.report.figure_style import IDENTIFIED_COLOR, NOMINAL_COLOR, STYLE, label_ticks
+from torchid.report.figure_style import IDENTIFIED_COLOR, NOMINAL_COLOR, STYLE, WIDTH, label_ticks
 
 COLORS = {REJECTED: NOMINAL_COLOR, SUSPICIOUS: "#e69f00", NOTE: IDENTIFIED_COLOR}
 _ROW = 0.16  # inches
 _HEAD = 1.0  # inches of a panel's title
-_WIDTH = 10.0  # inches of the figure
 _LINE_LETTERS = 130  # of a title, at font size 9
 _TITLE_LETTERS = 600
 #: Points of a curve.
@@ -44,7 +43,7 @@ def log_check_figure(logs: Sequence[Checked]) -> Figure:
     """One panel per log and one row per channel, with its range; findings are marked by the color of their severity."""
     lines = [len(_channels(checked.log)) + _title(checked).count("\n") for checked in logs]
     heights = [_ROW * count + _HEAD for count in lines]
-    figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
     panels = figure.subplots(len(logs), 1, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     for axes, checked in zip(panels, logs, strict=True):
         _draw_panel(axes, checked)
@@ -98,10 +97,10 @@ def _draw_panel(axes: Axes, checked: Checked) -> None:
                 if finding.field in (field, "time") and span.channel in ("", name):
                     axes.broken_barh([(0.5 * (start + end) - 0.5 * width, width)], (height - 0.5, 1.0), **style)
     axes.set(xlim=(time[0], max(time[-1], 1e-9)), ylim=(-len(channels) + 0.4, 0.6), xlabel="time [s]")
-    label_ticks(axes.yaxis, heights, [f"{field} {name}" for field, name in channels], fontsize=6)
+    label_ticks(axes.yaxis, heights, [f"{field} {name}" for field, name in channels], fontsize=7)
     axes.tick_params(axis="y", length=0)
     ranges = axes.secondary_yaxis("right")
-    ranges.set_yticks(heights, [_range_text(*channel, values) for channel, values in channels.items()], fontsize=6)
+    ranges.set_yticks(heights, [_range_text(*channel, values) for channel, values in channels.items()], fontsize=7)
     ranges.tick_params(axis="y", length=0)
     ranges.set_ylabel(f"range that fills a row: {_RANGE[0]:g} % to {_RANGE[1]:g} % of the values")
     axes.set_title(_title(checked), loc="left", fontsize=9)
