@@ -270,10 +270,10 @@ def _remarks(path: Path) -> Iterator[str]:
     described = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     parts = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in ast.walk(node)}
     for node in ast.walk(tree):
-        whole = isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and id(node) not in parts)
-        text = _texts(node, {})[0] if whole and id(node) not in described else ""
-        if len(text.split()) >= _FEWEST_WORDS and text[0] not in " ,;":
-            yield text
+        if isinstance(node, ast.Constant | ast.JoinedStr) and id(node) not in described:
+            text = _texts(node, {})[0] if isinstance(node, ast.JoinedStr) or id(node) not in parts else ""
+            if len(text.split()) >= _FEWEST_WORDS and text[0] not in " ,;":
+                yield text
 
 
 def _errors(path: Path) -> Iterator[tuple[str, str]]:
