@@ -93,7 +93,7 @@ def test_a_key_of_another_estimator_is_refused_by_those_that_have_it(
         lambda: load(file, changed(estimator=estimator)),
         file,
         f"estimator.{key}",
-        f"set, which {estimator['name']} has not; accepted: name: {having}, or no such key",
+        f"not used by {estimator['name']}; accepted: name: {having}, or leave it out",
     )
 
 
@@ -102,7 +102,7 @@ def test_a_key_of_another_estimator_is_refused_by_those_that_have_it(
 )
 def test_conditions_are_refused_where_violations_are_only_penalized(file: Path, setting: dict[str, Any]) -> None:
     estimator = {"name": "sgd", "consistency": "penalties"} | setting
-    found = "set, which consistency: penalties has not; accepted: consistency: log_cholesky, or no such key"
+    found = "not used with consistency: penalties; accepted: consistency: log_cholesky, or leave it out"
     assert_wrong_value(
         lambda: load(file, changed(estimator=estimator)), file, f"estimator.{next(iter(setting))}", found
     )
@@ -158,20 +158,20 @@ def test_an_unknown_key_of_a_descent_is_refused_by_the_nearest(
 
 
 def test_patience_needs_logs_to_hold_out(file: Path) -> None:
-    found = "set, without logs to hold out; accepted: logs.validation too"
+    found = "needs held-out logs; accepted: logs.validation"
     assert_wrong_value(lambda: load(file, descent(patience=3)), file, "estimator.training.patience", found)
     assert load(file, held_out(name="sgd", training={"patience": 3})).estimator.training.patience == 3
 
 
 def test_held_out_logs_are_for_a_descent_and_not_those_that_are_fitted_on(file: Path) -> None:
     for name in ("least_squares", "consistent"):
-        found = f"set, which {name} has no use for; accepted: estimator.name: sgd"
+        found = f"not used by {name}; accepted: estimator.name: sgd"
         assert_wrong_value(lambda name=name: load(file, held_out(name=name)), file, "logs.validation", found)
     both = held_out(name="sgd") | {"logs": {"train": ["a.npz", "b.npz"], "validation": ["b.npz"]}}
-    found = f"{file.parent / 'b.npz'} is fitted on as well; accepted: logs the fit does not see"
+    found = f"{file.parent / 'b.npz'} is also used for the fit; accepted: logs outside logs.train"
     assert_wrong_value(lambda: load(file, both), file, "logs.validation", found)
     both["logs"] = {"train": ["a.npz"], "validation": ["b.npz"], "test": ["b.npz"]}
-    with pytest.warns(TorchidWarning, match=r"b\.npz is a reason to stop as well"):
+    with pytest.warns(TorchidWarning, match=r"b\.npz is also used for early stopping"):
         load(file, both)
 
 

@@ -202,8 +202,8 @@ def test_noise_joins_a_named_set_and_a_named_set_keeps_the_noise(file: Path) -> 
         ({}, "no sensor"),
         ({"noise": {"joint_torque": 1.0}}, "no sensor"),
         ({"set": "full", "joint_torques": ["hip"]}, "set: full together with sensors by name"),
-        ({"joint_torques": ["hip", "knee", "hip"]}, "joint_torques: 'hip' named twice"),
-        ({"contact_wrenches": {"l_sole": ["fz", "fz"]}}, "contact_wrenches.l_sole: 'fz' named twice"),
+        ({"joint_torques": ["hip", "knee", "hip"]}, "joint_torques: 'hip' is named twice"),
+        ({"contact_wrenches": {"l_sole": ["fz", "fz"]}}, "contact_wrenches.l_sole: 'fz' is named twice"),
         ({"set": "joints", "contact_wrenches": {"sole": ["fx"]}}, "set: joints together with sensors by name"),
     ],
 )

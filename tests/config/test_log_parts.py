@@ -82,14 +82,14 @@ def test_the_written_settings_name_the_parts_and_are_read_again(folder: Path) ->
     ("entry", "field", "message"),
     [
         ({"file": "a.npz", "form": 0}, "logs.train.0", "unknown name 'form'; accepted: from"),
-        ({"from": 0}, "logs.train.0.file", "missing; accepted: the name of a log"),
-        ({"file": 3}, "logs.train.0.file", "found 3; accepted: the name of a log"),
-        ({"file": "a.npz", "from": [1]}, "logs.train.0.from", "found [1]; accepted: seconds"),
+        ({"from": 0}, "logs.train.0.file", "missing; accepted: a file name, or a mapping"),
+        ({"file": 3}, "logs.train.0.file", "found 3; accepted: a file name, or a mapping"),
+        ({"file": "a.npz", "from": [1]}, "logs.train.0.from", "found [1]; accepted: a time [s]"),
         ({"file": "a.npz", "from": "x"}, "logs.train", "'[x:]' is no range, and no such file exists"),
         ({"file": "a.npz", "fold": 6}, "logs.train.0.fold", "found 6; accepted: a whole number from 1 to 5"),
         ({"file": "a.npz", "fold": 0}, "logs.train.0.fold", "found 0; accepted: a whole number from 1 to 5"),
         ({"file": "a.npz", "fold": 1, "of": 1}, "logs.train.0.of", "found 1; accepted: a whole number from 2"),
-        ({"file": "a.npz", "of": 5}, "logs.train.0", "of together; accepted: from and to, or fold"),
+        ({"file": "a.npz", "of": 5}, "logs.train.0", "of without fold; accepted: from and to; or fold"),
         ({"file": "a.npz", "fold": 1, "to": 3}, "logs.train.0", "fold and to together; accepted"),
         ({"file": "a.npz", "fold": 1, "without_fold": 3}, "logs.train.0", "fold and without_fold together"),
     ],
@@ -107,23 +107,23 @@ def test_a_mapping_that_says_no_part_is_refused_by_its_field(
 def test_samples_that_are_fitted_and_tested_on_are_warned_of(folder: Path) -> None:
     overlapping = ({"train": ["a.npz[0:30]"], "test": ["a.npz[29:]"]}, {"train": ["a.npz[0:30]"], "test": ["a.npz"]})
     for named in overlapping:
-        with pytest.warns(TorchidWarning, match="logs.test: .*a.npz.* is fitted on as well; its errors say nothing"):
+        with pytest.warns(TorchidWarning, match="logs.test: .*a.npz.* is also used for the fit. Its errors are"):
             load(folder, **named)
 
 
 def test_samples_that_are_given_twice_are_refused(folder: Path) -> None:
     for train in (["a.npz[0:30]", "a.npz[29:]"], ["a.npz", "a.npz[29:]"], ["*.npz", "a.npz[:1]"]):
-        with pytest.raises(ConfigError, match="logs.train: .* and .* share samples; accepted: every sample once"):
+        with pytest.raises(ConfigError, match="logs.train: .* and .* share samples; accepted: each sample once"):
             load(folder, train=train)
     with pytest.raises(ConfigError, match="is given twice"):
         load(folder, train=["a.npz[0:30]", "*.npz[0:30]"])
-    with pytest.raises(ConfigError, match="logs.validation: .* is fitted on as well"):
+    with pytest.raises(ConfigError, match="logs.validation: .* is also used for the fit"):
         load(folder, sgd=True, train=["a.npz[0:30]"], validation=["a.npz[29:]"])
 
 
 def test_factors_have_no_parts(folder: Path) -> None:
     (folder / "a.factor").touch()
-    with pytest.raises(ConfigError, match="a part of factors, which have no samples"):
+    with pytest.raises(ConfigError, match="takes a part of factors, which have no samples"):
         load(folder, train=["a.factor[0:3]"])
 
 
@@ -149,10 +149,13 @@ def test_several_files_are_one_log_whose_name_says_which(folder: Path) -> None:
         ({"files": ["a.npz", "b.npz + c.h5"]}, r"logs.train.0.files.1: found '.*b.npz \+ c.h5'"),
         ({"files": ["a.npz", {"shift_s": 3}]}, r"logs.train.0.files.1: found \{'shift_s': 3\}"),
         ({"files": ["a.npz", {"file": "b.npz", "shift": 3}]}, "logs.train.0.files.1: unknown name 'shift'"),
-        ({"files": ["a.npz", {"file": "b.npz", "shift_s": "3 s"}]}, "files.1.shift_s: found '3 s'; accepted: seconds"),
+        (
+            {"files": ["a.npz", {"file": "b.npz", "shift_s": "3 s"}]},
+            "files.1.shift_s: found '3 s'; accepted: a time shift",
+        ),
         ({"files": ["a.npz", {"file": "b.npz", "shift_s": True}]}, "files.1.shift_s: found True"),
-        ({"files": ["a.npz", "b.npz"], "file": "c.h5"}, "logs.train.0: file and files together"),
-        ({"files": ["a.npz", "*.h5"]}, r"logs.train: .*\*.h5, a pattern among several files"),
+        ({"files": ["a.npz", "b.npz"], "file": "c.h5"}, "logs.train.0: both file and files"),
+        ({"files": ["a.npz", "*.h5"]}, r"logs.train: .*\*.h5 has a pattern; accepted: file names without patterns"),
     ],
 )
 def test_several_files_that_make_no_log_are_refused(folder: Path, entry: dict[str, Any], found: str) -> None:
@@ -173,5 +176,5 @@ def test_a_range_without_quotes_in_a_list_is_refused_with_how_to_write_it(folder
 
 def test_a_pattern_whose_range_is_the_end_of_a_file_is_refused(folder: Path) -> None:
     (folder / "a.npz[0:3]").touch()
-    with pytest.raises(ConfigError, match=r"a.npz\[0:3\] is a file that it matches without one"):
+    with pytest.raises(ConfigError, match=r"the brackets may be a range or part of the file name a.npz\[0:3\]"):
         load(folder, train=["*.npz[0:3]"])

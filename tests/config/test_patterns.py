@@ -56,4 +56,4 @@ def test_a_pattern_without_a_match_is_refused_by_its_place(logs: Path) -> None:
         assert line.startswith(
             f"{logs.parent / 'experiment.yaml'}: logs.{place}: no file matches {logs / 'run_*.npz'}; "
         )
-        assert "accepted: a log, or a pattern of several" in line
+        assert "accepted: an existing log, or a matching pattern" in line

@@ -98,14 +98,14 @@ def test_what_a_simulation_writes_down_reads_back_as_itself_anywhere(file: Path,
     ("physics", "control"), [(1000, 300), (1000, 2000), (1000, 999), (1000, 1001), (1000, 400.1), (1000, 1e13)]
 )
 def test_a_controller_between_two_physics_steps_is_refused(file: Path, physics: float, control: float) -> None:
-    message = f"control_hz: {control:g}; accepted: 1000 over a whole number"
+    message = f"control_hz: {control:g}; accepted: 1000 / a whole number"
     with pytest.raises(ConfigError, match=re.escape(message)):
         load(file, changed(physics_hz=physics, control_hz=control))
 
 
 def test_motions_of_one_name_are_refused(file: Path) -> None:
     one, other = ({"name": name, "duration_s": 1.0} for name in "ab")
-    with pytest.raises(ConfigError, match="motions: several named 'b'; accepted: a name of its own for every motion"):
+    with pytest.raises(ConfigError, match="motions: several named 'b'; accepted: different names"):
         load(file, changed(motions=[one, other, other]))
 
 

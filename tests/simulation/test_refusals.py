@@ -74,7 +74,10 @@ SETTINGS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "two motions of one name": ({"motions": [SQUAT, SQUAT]}, ("motions: several named 'm'",)),
     "name that is no file name": (moved(name="a/b"), ("motions.0.name: found 'a/b'",)),
     "no motion": ({"motions": []}, ("motions: an empty list",)),
-    "control between two steps": ({"control_hz": 300}, ("control_hz: 300; accepted: 1000 over a whole number",)),
+    "control between two steps": (
+        {"control_hz": 300},
+        ("control_hz: 300; accepted: 1000 / a whole number",),
+    ),
     "control faster than physics": ({"control_hz": 2000}, ("control_hz: 2000",)),
     "unknown key": ({"sensors": {"noice": {}}}, ("sensors: unknown name 'noice'; accepted: noise",)),
     "unknown key at the top": ({"foot": FEET}, ("key: unknown name 'foot'", "feet")),

@@ -51,10 +51,10 @@ class SymmetryConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class TrainingConfig(TrainingSettings):
-    """How to train, with what belongs to a run of it: the mini-batches, and when something is written.
+    """Training of `sgd`: `batch_size` samples a mini-batch, in an order by `seed`.
 
-    `batch_size`: samples per mini-batch, `seed` of their order. Errors are evaluated every `evaluate_every` epochs, a
-    checkpoint is written after `checkpoint_seconds` and the end of the epoch.
+    Errors are evaluated every `evaluate_every` epochs. A checkpoint is written at the end of an epoch, at most every
+    `checkpoint_seconds`.
     """
 
     batch_size: Count = 256
@@ -65,7 +65,7 @@ class TrainingConfig(TrainingSettings):
 
 @dataclass(config=STRICT, frozen=True)
 class MassConfig:
-    """A known mass and its standard deviation [kg], 0 for an exact one."""
+    """A known mass [kg]. `std`: its standard deviation [kg], 0 for an exact mass."""
 
     value: Positive
     std: NotNegative = 0.0
@@ -86,10 +86,10 @@ LossKind = Literal["huber", "tukey"]
 
 @dataclass(config=STRICT, frozen=True)
 class RobustConfig:
-    """Rows that fit badly count less, in re-weighted passes.
+    """Outliers get smaller weights, in at most `passes` repeated fits.
 
-    `loss` of whitened residuals, `tuning` in robust standard deviations (None: 1.345 for huber, 4.685 for tukey),
-    `passes` at most.
+    `loss`: of the whitened residuals. `tuning`: residual from which weights decrease, in robust standard deviations;
+    null: 1.345 for huber, 4.685 for tukey.
     """
 
     loss: LossKind
@@ -113,7 +113,7 @@ Solver = TypeVar("Solver", LeastSquares, Consistent, Sgd)
 
 @dataclass(config=STRICT, frozen=True)
 class TaskWeightsConfig:
-    """How much errors of joint torques, and of the base along its own axes, count in the fit; None for 1."""
+    """Weights of errors in the fit: of joint torques, and of base force and moment along the base's axes; null: 1."""
 
     joint_torque: PerJoint | None = None
     base_force: PerAxis | None = None
@@ -122,14 +122,7 @@ class TaskWeightsConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class _FitConfig:
-    """What is fitted and how, whatever the estimator.
-
-    `ridge`: auto, `torchid.fitting.left_out.RIDGE` of the mean squared residual, or more where that predicts left-out
-    blocks better; one_standard_error, the largest that predicts them within one standard error of the best.
-    `friction: false` leaves friction at the URDF's values, `frozen` bodies keep all of theirs; `robust` weighs outliers
-    down in a batch fit, `task_weights` say which errors count most. `total_mass` and `masses` of bodies by name are
-    known, as from a scale.
-    """
+    """What is fitted, for every estimator; see `EstimatorConfig`."""
 
     name: Literal["least_squares", "consistent", "sgd"] = "consistent"
     ridge: Ridge = AUTO
@@ -144,11 +137,7 @@ class _FitConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class _ConditionsConfig:
-    """What makes `Conditions`, together with a robot.
-
-    `com_inside` keeps centres of mass in what encloses the bodies' `com_shapes`, `symmetry`
-    makes left and right mirror images, `bounds` are [lower, upper] by body and parameter, null for none.
-    """
+    """Conditions that the identified bodies must meet; see `EstimatorConfig`."""
 
     margin: BelowOne = Conditions.margin
     com_inside: EnclosureKind | None = None
@@ -159,9 +148,24 @@ class _ConditionsConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class EstimatorConfig(_ConditionsConfig, _FitConfig):
-    """An estimator by its name, with the keys of all: what a key means and accepts is said where its default is from.
+    """An estimator by its name, with the keys of all estimators. A file may set only the keys of its estimator.
 
-    A file may set only the keys of the estimator it names, see `validate_keys`.
+    Attributes:
+        ridge: weight of the prior. auto: `torchid.fitting.left_out.RIDGE` times the mean square of the residuals, or
+            more if that predicts held-out blocks better. one_standard_error: the largest ridge whose error on held-out
+            blocks is within one standard error of the smallest.
+        rank_tolerance: smallest singular value that counts as determined, as a share of the largest.
+        friction: false keeps the friction of the robot's file.
+        frozen: bodies that keep all parameters of the robot's file.
+        robust: smaller weights for outliers; not for `sgd`.
+        task_weights: weights of the errors of joint torques and of the base.
+        total_mass: known mass of the robot [kg], for example from a scale.
+        masses: known masses of bodies by name [kg].
+        margin: smallest allowed eigenvalue of each body's scaled pseudo-inertia.
+        com_inside: enclosure of each body's shapes that must contain its centre of mass.
+        com_shapes: these shapes.
+        symmetry: left and right bodies are mirror images.
+        bounds: [lower, upper] by body and parameter; null: no bound.
     """
 
     prior: Prior = Consistent.prior
@@ -204,25 +208,21 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
 
 
 def validate_keys(estimator: EstimatorConfig) -> None:
-    """Refuse a setting that the estimator has not: it would be ignored in silence.
-
-    Raises:
-        ConfigError: names the estimators that have it.
-    """
+    """Refuse a setting that the estimator does not use. Raises ConfigError: names the estimators that use it."""
     defaults = EstimatorConfig()
     for key, value in vars(estimator).items():
         having = _estimators_with(key)
         if estimator.name not in having and value != getattr(defaults, key):
-            reason = f"set, which {estimator.name} has not"
-            raise ConfigError.at_field(f"estimator.{key}", reason, f"name: {' or '.join(having)}, or no such key")
+            reason = f"not used by {estimator.name}"
+            raise ConfigError.at_field(f"estimator.{key}", reason, f"name: {' or '.join(having)}, or leave it out")
     if estimator.name == "sgd" and estimator.consistency == "penalties":
         for key in (*_fields(_ConditionsConfig), "prior"):
             if key not in ("margin", "com_shapes") and getattr(estimator, key) != getattr(defaults, key):
-                reason = "set, which consistency: penalties has not"
-                raise ConfigError.at_field(f"estimator.{key}", reason, "consistency: log_cholesky, or no such key")
+                reason = "not used with consistency: penalties"
+                raise ConfigError.at_field(f"estimator.{key}", reason, "consistency: log_cholesky, or leave it out")
     if estimator.consistency != "penalties" and estimator.penalties != defaults.penalties:
-        reason = f"set, which consistency: {estimator.consistency} has not"
-        raise ConfigError.at_field("estimator.penalties", reason, "consistency: penalties, or no such key")
+        reason = f"not used with consistency: {estimator.consistency}"
+        raise ConfigError.at_field("estimator.penalties", reason, "consistency: penalties, or leave it out")
 
 
 _OF_BATCH_FITS = {"robust"}

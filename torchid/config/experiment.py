@@ -54,10 +54,13 @@ Scenarios = dict[FileName, Annotated[list[list[str]], Field(min_length=1)]]
 
 @dataclass(config=STRICT, frozen=True)
 class CandidatesConfig:
-    """Sensors that could be mounted: torques of `joint_torques` (None: all), and at the contacts devices or axes.
+    """Sensors that could be mounted.
 
-    `ft_sensors`: fixed joints that could carry a force/torque sensor, a device unless `contacts` are axes.
-    `normal_forces`: contacts that could carry a scalar sensor, `fn`, beside a device or alone.
+    Attributes:
+        joint_torques: joints that could carry a torque sensor; null: all joints.
+        contacts: at each contact a force/torque sensor (device), single axes of one (axis), or nothing (none).
+        ft_sensors: fixed joints that could carry a force/torque sensor, or single axes of one, as `contacts` says.
+        normal_forces: contacts that could carry a sensor of the normal force, `fn`.
     """
 
     joint_torques: list[str] | None = None
@@ -68,14 +71,19 @@ class CandidatesConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class AnalysisConfig:
-    """Which sensors to plan for, and which sensor sets to compare.
+    """Sensor planning, and comparison of sensor sets.
 
-    `scenarios`: contact states by scenario, each a list of the frames in contact; None: the states of the training
-    logs, or, without logs, all contacts at once. `keep`: candidates that every plan has, `exclude`: that none has;
-    `costs` per channel, by candidate or by kind (joint_torque, contact, normal_force, ft_sensor). `criterion`:
-    per_sample, the base survives the projection of every sample (None, for a floating base); stack, many samples
-    together determine all that full sensing would (None, for a fixed one). `compare`: sensor sets whose fits of the
-    training logs are measured on the test logs.
+    Attributes:
+        scenarios: contact states by scenario, each a list of frames in contact; null: the states of the training logs,
+            or all contacts at once without logs.
+        candidates: sensors that could be mounted.
+        keep: candidates that every plan contains.
+        exclude: candidates that no plan contains.
+        costs: cost of one channel, by candidate or by kind (joint_torque, contact, normal_force, ft_sensor).
+        criterion: per_sample: each sample determines the base. stack: all samples together determine as much as with
+            all candidates. null: per_sample for a floating base, stack for a fixed base.
+        compare: sensor sets by name. Each is fitted to the training logs and tested on the test logs.
+        seed: of the random postures.
     """
 
     scenarios: Annotated[Scenarios, Field(min_length=1)] | None = None
@@ -90,17 +98,20 @@ class AnalysisConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class ActuatorsConfig:
-    """Unknown terms of the actuators, of every joint whose torque is measured.
+    """Unknown terms of every joint whose torque is measured.
 
-    `armature`: reflected rotor inertia; `torque_offset`; `asymmetric_coulomb`: Coulomb friction that differs by
-    direction; `stiffness` of springs, or of cables that act as such; `sign_width` [rad/s or m/s]: Coulomb friction goes
-    with tanh(velocity / width) instead of the sign; auto, with the width that leaves least of the training logs.
-    `stribeck` [rad/s or m/s]: friction at rest beyond Coulomb friction, which drops with exp(-(velocity / stribeck)^2);
-    auto, with the velocity that leaves least, or without such friction where the logs do not determine it.
-    `delay` [s]: joint torques act so much later than recorded or commanded; auto, the delay that leaves least.
-    `stiction`: where a joint rests, friction is whatever holds it, so that its torque counts as unmeasured.
+    auto: a term is kept if a fit with it predicts held-out blocks of the training logs better, and its value is chosen.
 
-    auto: as blocks of the training logs that a fit has not seen are predicted better (`torchid.fitting.left_out`).
+    Attributes:
+        armature: reflected rotor inertia.
+        torque_offset: constant offset of the torque.
+        asymmetric_coulomb: Coulomb friction that differs by direction.
+        stribeck: velocity scale [rad/s or m/s]. Friction at rest exceeds Coulomb friction; the excess decays with
+            exp(-(velocity / stribeck)^2). null: none.
+        stiffness: springs, or cables that act as springs.
+        sign_width: Coulomb friction follows tanh(velocity / sign_width) [rad/s or m/s]; null: the sign of the velocity.
+        delay: time from the recorded or commanded torque until it acts [s].
+        stiction: leave out torques of joints at rest, where friction takes any value below Coulomb friction.
     """
 
     armature: BoolOrAuto = AUTO
@@ -132,14 +143,14 @@ class ActuatorsConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class FiguresConfig:
-    """How figures are written: `format`, of their files. TensorBoard and `report.html` have pictures of their own."""
+    """Figures of the run folder. `format`: their file format."""
 
     format: Literal["png", "pdf", "svg"] = "png"
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class _Common:
-    """The keys of identification and analysis alike; no `output`, as Python alone may say: nothing is written."""
+    """Keys of identification and analysis. `output` has no default; only Python may pass None: nothing is written."""
 
     robot: RobotConfig
     sensors: Sensors = dataclasses.field(default_factory=SensorsConfig)
@@ -164,7 +175,7 @@ class ExperimentConfig(_Common):
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class AnalyzeConfig(_Common):
-    """The same file for an analysis, which needs neither logs nor sensors; `sensors` may be `noise` alone."""
+    """The same file for an analysis. `logs` may be missing; `sensors` may be missing or contain `noise` alone."""
 
     logs: LogsConfig | None = None
 
@@ -247,8 +258,7 @@ def load_config(
         require_one_file(config.robot)
         validate_choice("sensors", config.sensors)
         validate_keys(config.estimator)
-        _check_extras(config)
-        _check_threshold(config.preprocessing)
+        _check_conflicts(config)
         return dataclasses.replace(config, logs=_checked_logs(config, config.logs)) if reads_logs else config
 
 
@@ -268,16 +278,15 @@ def load_analysis(
         require_one_file(config.robot)
         validate_choice("sensors", config.sensors, may_be_empty=True)
         validate_keys(config.estimator)
-        _check_extras(config)
-        _check_threshold(config.preprocessing)
+        _check_conflicts(config)
         for name, choice in config.analysis.compare.items():
             validate_choice(f"analysis.compare.{name}", choice)
         if config.logs is not None:
             config.logs.require_samples(command)
             return dataclasses.replace(config, logs=_checked_logs(config, config.logs))
         if config.analysis.compare:
-            reason = "set, without logs to predict accuracy from"
-            raise ConfigError.at_field("analysis.compare", reason, "logs.train too")
+            reason = "needs logs to measure accuracy"
+            raise ConfigError.at_field("analysis.compare", reason, "logs.train")
     return config
 
 
@@ -301,41 +310,36 @@ def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:
     return [config.robot.path, *(logs.files if logs else [])]
 
 
-def _check_threshold(settings: PreprocessingConfig) -> None:
-    """Refuse two sources of contact flags, and a threshold below that is above."""
-    threshold = settings.contact_threshold
-    key = "preprocessing.contact_threshold"
-    if threshold is None:
-        return
-    if settings.detect_contacts is not None:
-        reason = "set together with preprocessing.detect_contacts, which makes the same flags"
-        raise ConfigError.at_field(key, reason, "one of the two")
-    if threshold.below is not None and threshold.below > threshold.above:
-        reason = f"{threshold.below:g}, more than above ({threshold.above:g})"
-        raise ConfigError.at_field(f"{key}.below", reason, "a force [N] up to that of above")
-
-
-def _check_extras(config: _Common) -> None:
-    """Refuse the same extra parameter under two keys, and extra parameters for a descent, which has none."""
+def _check_conflicts(config: _Common) -> None:
+    """Refuse the same extra parameter or contact flags under two keys, and settings that contradict each other."""
     actuators = config.actuators
-    sensors = config.sensors
-    if actuators.torque_offset is True and "joint_torque" in sensors.offsets:
-        reason = "set together with sensors.offsets.joint_torque, which is the same"
-        raise ConfigError.at_field("actuators.torque_offset", reason, "one of the two")
+    offsets = config.sensors.offsets
+    threshold = config.preprocessing.contact_threshold
+    in_air = next((kind for kind in ("contact_force", "contact_moment") if kind in offsets), "")
+    twice = (
+        (actuators.torque_offset is True and "joint_torque" in offsets,
+         "actuators.torque_offset", "the same as sensors.offsets.joint_torque"),
+        (config.robot.base_tilt is not None and config.preprocessing.base_motion is not None,
+         "robot.base_tilt", "preprocessing.base_motion already finds the tilt of the base"),
+        (threshold is not None and config.preprocessing.detect_contacts is not None,
+         "preprocessing.contact_threshold", "preprocessing.detect_contacts makes the same flags"),
+        (config.preprocessing.zero_in_air and in_air,
+         f"sensors.offsets.{in_air}", "preprocessing.zero_in_air subtracts the same"),
+    )  # fmt: skip
+    for applies, field, reason in twice:
+        if applies:
+            raise ConfigError.at_field(field, reason, "one of the two")
     if actuators.stribeck is not None and not config.estimator.friction:
-        reason = "set, but estimator.friction: false leaves the Coulomb friction that it drops to at the URDF's"
-        raise ConfigError.at_field("actuators.stribeck", reason, "estimator.friction: true, or no such key")
-    if config.robot.base_tilt is not None and config.preprocessing.base_motion is not None:
-        reason = "set together with preprocessing.base_motion, which finds how the base itself is turned"
-        raise ConfigError.at_field("robot.base_tilt", reason, "one of the two")
-    twice = [kind for kind in ("contact_force", "contact_moment") if kind in sensors.offsets]
-    if config.preprocessing.zero_in_air and twice:
-        reason = "set together with preprocessing.zero_in_air, which subtracts the same"
-        raise ConfigError.at_field(f"sensors.offsets.{twice[0]}", reason, "one of the two")
+        reason = "needs fitted Coulomb friction, but estimator.friction is false"
+        raise ConfigError.at_field("actuators.stribeck", reason, "estimator.friction: true, or leave it out")
+    if threshold is not None and threshold.below is not None and threshold.below > threshold.above:
+        reason = f"{threshold.below:g} N is more than above ({threshold.above:g} N)"
+        key = "preprocessing.contact_threshold.below"
+        raise ConfigError.at_field(key, reason, "a force [N], at most that of above")
 
 
 def _checked_logs(config: _Common, logs: LogsConfig) -> LogsConfig:
-    """The logs with patterns resolved; refuses logs that an estimator has no use for, or with two uses."""
+    """The logs with patterns resolved; refuses logs that the estimator cannot use, or samples with two uses."""
     _check_held_out(config.estimator, logs)
     checked = resolve_logs(logs)
     if logs.topics is not None:
@@ -347,41 +351,37 @@ def _checked_logs(config: _Common, logs: LogsConfig) -> LogsConfig:
 
 
 def _check_factors(config: _Common, logs: LogsConfig) -> None:
-    """Refuse factors of logs beside logs, for tests, and for whatever needs samples."""
+    """Refuse factors together with logs, for tests, and for settings that need samples."""
     for key in ("test", "validation"):
         for path in getattr(logs, key):
             if path.suffix == FACTORS:
-                raise ConfigError.at_field(f"logs.{key}", f"{path}, factors without samples to predict", "logs")
+                raise ConfigError.at_field(f"logs.{key}", f"{path} has factors, without samples to predict", "logs")
     if not logs.compressed:
         return
     for path in logs.train:
         if path.suffix != FACTORS:
-            found = f"{path} beside factors of other logs"
-            raise ConfigError.at_field("logs.train", found, f"logs alone, or {FACTORS} files alone")
-    reason = "but logs.train names factors, which have no samples"
+            found = f"{path} is a log, but other entries are factors"
+            raise ConfigError.at_field("logs.train", found, f"only logs, or only {FACTORS} files")
+    reason = "but logs.train has factors, without samples"
     unfit = (
         ("estimator.name", "sgd", config.estimator.name == "sgd", "least_squares or consistent"),
         ("estimator.robust", "set", config.estimator.robust is not None, "null"),
-        ("estimator.task_weights", "set", config.estimator.task_weights != TaskWeightsConfig(), "no such key"),
+        ("estimator.task_weights", "set", config.estimator.task_weights != TaskWeightsConfig(), "leave it out"),
         (
             "preprocessing.exclude_rejected",
             "true",
             config.preprocessing.exclude_rejected,
-            "false, as torchid compress has left them out if it was told so",
+            "false (torchid compress applies this key)",
         ),
     )
     for field, found, is_unfit, accepted in unfit:
         if is_unfit:
-            raise ConfigError.at_field(field, f"{found}, {reason}", f"{accepted}, or the logs")
+            raise ConfigError.at_field(field, f"{found}, {reason}", f"{accepted}, or logs instead of factors")
 
 
 def _check_held_out(estimator: EstimatorConfig, logs: LogsConfig) -> None:
     """Refuse held-out logs without a descent, and patience without held-out logs."""
     if logs.validation and estimator.name != "sgd":
-        raise ConfigError.at_field(
-            "logs.validation", f"set, which {estimator.name} has no use for", "estimator.name: sgd"
-        )
+        raise ConfigError.at_field("logs.validation", f"not used by {estimator.name}", "estimator.name: sgd")
     if estimator.training.patience is not None and not logs.validation:
-        raise ConfigError.at_field(
-            "estimator.training.patience", "set, without logs to hold out", "logs.validation too"
-        )
+        raise ConfigError.at_field("estimator.training.patience", "needs held-out logs", "logs.validation")

@@ -33,7 +33,7 @@ _USUAL_FOLDS = 5
 """Folds that a log is cut into where an entry names one and not their number."""
 
 _KEYS = ("file", "files", "from", "to", "fold", "without_fold", "of", "payload")
-_ENTRY = "the name of a log, or a mapping with file, or files, and from, to, fold, without_fold or payload"
+_ENTRY = "a file name, or a mapping with file (or files) and, if needed, from, to, fold, without_fold, payload"
 _FILES = "several files as one log, [motion.csv, {file: plates.csv, shift_s: 0.12}], the first with its stamps"
 
 PAYLOAD_ACCEPTED = "a mapping with link, mass [kg], center_of_mass [x, y, z in m] and inertia, or a list of several"
@@ -48,13 +48,18 @@ _PAYLOAD_ACCEPTED = {
 
 @dataclass(config=STRICT, frozen=True)
 class LogsConfig:
-    """Logs to fit on, held-out logs for the early stopping of a descent, and logs for tests alone.
+    """Logs of an experiment.
 
-    A name with `*` or `?` is a pattern for all files that match. A range behind a name takes a part of each log, as if
-    it were a log of its own: `walk.npz[0:30]`, see `TimeRange`; mappings say the same in words (`entries_spelled_out`).
-    `payloads` are what the robot carried in a file, by its absolute path, whatever part of it is taken.
-    `topics` describes the topics of bags, `columns` those of foreign tables and arrays. The logs to fit on may be
-    factors of logs, from `torchid compress`, which may lie elsewhere: `s3://...`.
+    A name with `*` or `?` is a pattern for all files that match. A range behind a name takes a part of each log:
+    `walk.npz[0:30]`, see `TimeRange`. Mappings say the same in words (`entries_spelled_out`).
+
+    Attributes:
+        train: logs to fit, or their factors, written by `torchid compress`; factors may be remote: `s3://...`.
+        test: logs for tests only.
+        validation: held-out logs for early stopping of `sgd`.
+        topics: map of the topics of bags.
+        columns: map of the columns of foreign tables and arrays.
+        payloads: what the robot carried in a recording, by the absolute path of its file.
     """
 
     train: Annotated[list[Path], Field(min_length=1)]
@@ -82,7 +87,7 @@ class LogsConfig:
     def require_samples(self, command: str) -> None:
         """Refuse factors where samples are needed. Raises ConfigError: names the file."""
         if self.compressed:
-            reason = f"{self.train[0]}, factors of a log, where torchid {command} needs its samples"
+            reason = f"{self.train[0]} has factors, but torchid {command} needs samples"
             raise ConfigError.at_field("logs.train", reason, f"logs ({', '.join(READABLE)})")
 
 
@@ -125,7 +130,7 @@ def _add_payloads(payloads: dict[str, Any], field: str, entry: object) -> None:
     if not new:
         raise ConfigError.at_field(field, "an empty list", PAYLOAD_ACCEPTED)
     if payloads.get(file, new) != new:
-        raise ConfigError.at_field(field, f"another than that of {file} elsewhere", "one payload in all of a recording")
+        raise ConfigError.at_field(field, f"differs from another payload of {file}", "one payload for each recording")
     payloads[file] = new
 
 
@@ -158,8 +163,8 @@ def _names(field: str, entry: object) -> Iterator[object]:
     folds = [key for key in ("fold", "without_fold") if key in entry]
     bounds = [key for key in ("from", "to") if key in entry]
     if len(folds) + bool(bounds) > 1 or ("of" in entry and not folds):
-        reason = f"{' and '.join([*folds, *bounds, *(['of'] if not folds else [])])} together"
-        accepted = "from and to, or fold, or without_fold; of (the number of folds) with one of the last two"
+        reason = "of without fold" if "of" in entry and not folds else f"{' and '.join([*folds, *bounds])} together"
+        accepted = "from and to; or fold; or without_fold; of (number of folds) only with fold or without_fold"
         raise ConfigError.at_field(field, reason, accepted)
     if not folds:
         start, stop = (_bound(f"{field}.{key}", entry.get(key)) for key in ("from", "to"))
@@ -174,7 +179,7 @@ def _file(field: str, entry: Mapping[str, object]) -> str:
     """The name of the log of a mapping without its range."""
     if "files" in entry:
         if "file" in entry:
-            raise ConfigError.at_field(field, "file and files together", "one of the two")
+            raise ConfigError.at_field(field, "both file and files", "one of the two")
         files = entry["files"]
         if not isinstance(files, list) or len(files) < 2:
             reason = "one file" if isinstance(files, list) and files else f"found {excerpt(repr(files))}"
@@ -199,7 +204,7 @@ def _joined(field: str, entry: object) -> LogFile:
     if not isinstance(file, str) or not file or JOINED in file:
         raise ConfigError.at_field(field, f"found {excerpt(repr(entry))}", _FILES)
     if isinstance(shift, bool) or not isinstance(shift, (int, float)) or not math.isfinite(shift):
-        raise ConfigError.at_field(f"{field}.shift_s", f"found {excerpt(repr(shift))}", "seconds, added to its stamps")
+        raise ConfigError.at_field(f"{field}.shift_s", f"found {excerpt(repr(shift))}", "a time shift [s]")
     return LogFile(Path(file), float(shift))
 
 
@@ -216,13 +221,13 @@ def _bound(field: str, value: object) -> str:
     if value is None:
         return ""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise ConfigError.at_field(field, f"found {excerpt(repr(value))}", "seconds, or a share such as 80%")
+        raise ConfigError.at_field(field, f"found {excerpt(repr(value))}", "a time [s], or a share such as 80%")
     return str(value)
 
 
 def _count(field: str, value: object, least: int, most: int | None = None) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < least or (most is not None and value > most):
-        accepted = f"a whole number from {least}" + ("" if most is None else f" to {most}, that of folds")
+        accepted = f"a whole number from {least}" + ("" if most is None else f" to {most} (number of folds)")
         raise ConfigError.at_field(field, f"found {excerpt(repr(value))}", accepted)
     return value
 
@@ -234,10 +239,10 @@ def resolve_logs(logs: LogsConfig) -> LogsConfig:
     """The logs with patterns resolved.
 
     Raises:
-        ConfigError: no file matches, a range that is none, or samples with two uses that exclude each other.
+        ConfigError: no file matches, a bad range, or samples with two uses that exclude each other.
 
     Warns:
-        TorchidWarning: samples are tested on that had another use.
+        TorchidWarning: test samples that had another use.
     """
     files = {key: _matching(f"logs.{key}", getattr(logs, key)) for key in SETS}
     require_apart(_parts(files), _surely_share)
@@ -245,7 +250,7 @@ def resolve_logs(logs: LogsConfig) -> LogsConfig:
 
 
 def tests_on_seen_samples(logs: LogsConfig) -> bool:
-    """Whether samples are tested on that are fitted on, or decide when to stop, as far as ranges alone say."""
+    """Whether test samples are also fitted or used for early stopping, judged by their ranges."""
     parts = _parts({key: getattr(logs, key) for key in SETS})
     return any(any(_sharing(parts, key, "test", _surely_share)) for key in ("train", "validation"))
 
@@ -264,16 +269,16 @@ def _resolved_payloads(logs: LogsConfig) -> dict[str, list[Payload]]:
     for name, payloads in logs.payloads.items():
         field = "logs.payloads"
         if not Path(name).is_absolute():
-            reason = f"{name}, a relative path"
+            reason = f"{name} is a relative path"
             accepted = "payload: {...} in an entry of logs.train or logs.test"
             raise ConfigError.at_field(field, reason, accepted)
         for path in _matching(field, [Path(name)]):
             if path.suffix == FACTORS:
-                reason = f"{path}, factors, which torchid compress has freed of a payload already"
+                reason = f"{path}: torchid compress has already removed the payload"
                 raise ConfigError.at_field(field, reason, "payloads of logs")
             recording = _recording(_part(field, path))
             if out.get(recording, payloads) != payloads:
-                raise ConfigError.at_field(field, f"two for {recording}", "one payload in all of a recording")
+                raise ConfigError.at_field(field, f"two payloads for {recording}", "one payload for each recording")
             out[recording] = payloads
     return out
 
@@ -292,22 +297,22 @@ def require_apart(parts: Parts, share: Callable[[LogPart, LogPart], bool]) -> No
 
     Args:
         parts: of logs.
-        share: whether two of the same file, or of the same first of several, share samples.
+        share: whether two parts of the same file, or of the same first file of several, share samples.
 
     Raises:
-        ConfigError: samples that are fitted on twice, or decide when to stop as well.
+        ConfigError: samples that are fitted twice, or fitted and used for early stopping.
 
     Warns:
-        TorchidWarning: samples are tested on that had another use.
+        TorchidWarning: test samples that had another use.
     """
-    for key, use in (("train", "fitted on"), ("validation", "a reason to stop")):
+    for key, use in (("train", "for the fit"), ("validation", "for early stopping")):
         if both := sorted(str(part) for _, part in _sharing(parts, key, "test", share)):
-            warn_about_file(f"logs.test: {both[0]} is {use} as well; its errors say nothing of unseen motion")
+            warn_about_file(f"logs.test: {both[0]} is also used {use}. Its errors are not those of unseen motion.")
     if both := sorted(str(part) for _, part in _sharing(parts, "train", "validation", share)):
-        raise ConfigError.at_field("logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
+        raise ConfigError.at_field("logs.validation", f"{both[0]} is also used for the fit", "logs outside logs.train")
     for key in SETS:
         for part, other in _sharing(parts, key, key, share):
-            raise ConfigError.at_field(f"logs.{key}", f"{part} and {other} share samples", "every sample once")
+            raise ConfigError.at_field(f"logs.{key}", f"{part} and {other} share samples", "each sample once")
 
 
 def _sharing(
@@ -337,11 +342,11 @@ def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         part = _part(field, path)
         if part.range is not None and part.file.suffix == FACTORS:
-            reason = f"{path}, a part of factors, which have no samples"
-            raise ConfigError.at_field(field, reason, f"{FACTORS} files as they are, or parts of logs")
+            reason = f"{path} takes a part of factors, which have no samples"
+            raise ConfigError.at_field(field, reason, f"whole {FACTORS} files, or parts of logs")
         if part.joins and {"*", "?"} & set("".join(file.path.name for file in part.files)):
             raise ConfigError.at_field(
-                field, f"{path}, a pattern among several files", f"every file, {JOINED_ACCEPTED}"
+                field, f"{path} has a pattern", f"file names without patterns, {JOINED_ACCEPTED}"
             )
         if part.joins or not {"*", "?"} & set(part.file.name) or part.file.exists():
             out.append(path)
@@ -349,15 +354,15 @@ def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
         files = _listed(part.file)
         if part.range is not None:
             if named := _listed(path):
-                reason = f"{path}, a pattern with a range, but {named[0].name} is a file that it matches without one"
-                raise ConfigError.at_field(field, reason, "names without brackets, or each log by its name")
+                reason = f"{path}: the brackets may be a range or part of the file name {named[0].name}"
+                raise ConfigError.at_field(field, reason, "file names without brackets, or each log by its name")
             files = [file.with_name(file.name + part.range.text) for file in files]
         if not files:
-            raise ConfigError.at_field(field, f"no file matches {part.file}", "a log, or a pattern of several")
+            raise ConfigError.at_field(field, f"no file matches {part.file}", "an existing log, or a matching pattern")
         out += files
     again = [path for path in out if out.count(path) > 1]
     if again:
-        raise ConfigError.at_field(field, f"{again[0]} is given twice", "every log once")
+        raise ConfigError.at_field(field, f"{again[0]} is given twice", "each log once")
     return out
 
 
@@ -387,22 +392,21 @@ def _threshold(value: object) -> object:
 
 @dataclass(config=STRICT, frozen=True)
 class PreprocessingConfig:
-    """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
+    """Filter, gaps and contacts: what happens to logs before the fit.
 
-    `cutoff_hz`: auto, one that the motion of the training logs and its noise ask for, see `choose_cutoff`.
-    `sample_rate_hz`: auto, every k-th sample of a log that is filtered, see `lay_out_timeline`.
-    `bridge_gaps_s`: gaps (NaN) of at most so long [s] are filled before anything else is done; None leaves them.
-    `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none;
-    auto, as many as make the fit worse where feet stand (`torchid.fitting.left_out`).
-    `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
-    recorded ones.
-    `contact_threshold`: a force [N], or its settings, for contact flags from forces (`ContactThreshold`) likewise.
-    `zero_in_air`: subtract from contact sensors what they read on average in the air, from each log for itself.
-    `base_motion`: contacts, from the feet that stand on a floor, whatever was recorded of it; None for as recorded.
-    `max_slip`: speed [m/s] above which a contact that should stand slips, so that the sample is dropped; auto, from the
-    noise of each contact's velocity; None keeps all.
-    `exclude_rejected`: leave out the samples that `torchid check` rejects.
-    `memory_gb`: a log whose arrays take more than an eighth [GB] is read in parts, its samples kept on the disk.
+    Attributes:
+        cutoff_hz: of the zero-phase low-pass filter [Hz]; null: no filter; auto: from the motion and its noise.
+        sample_rate_hz: rate after resampling [Hz]; null: as recorded; auto: every k-th sample of a filtered log.
+        bridge_gaps_s: gaps (NaN) up to this length are interpolated [s]; null: none.
+        contact_margin_s: samples closer to a change of contact are left out [s]; null: none; auto: if they make the fit
+            worse.
+        detect_contacts: true, or settings: flags from joint torques replace recorded contact flags (`DetectionConfig`).
+        contact_threshold: force [N], or settings: flags from measured forces replace recorded contact flags.
+        zero_in_air: subtract the mean reading in the air from each contact sensor, for each log.
+        base_motion: contacts: base motion from standing feet replaces the recorded motion; null: as recorded.
+        max_slip: samples whose standing contact moves faster are left out [m/s]; null: none; auto: from velocity noise.
+        exclude_rejected: leave out the samples that `torchid check` rejects.
+        memory_gb: logs whose arrays need more than an eighth of it are read in parts, with their samples on disk [GB].
     """
 
     cutoff_hz: PositiveOrAuto = None

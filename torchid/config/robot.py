@@ -46,10 +46,10 @@ Frames = Annotated[
 
 @dataclass(config=STRICT, frozen=True)
 class LoopConfig:
-    """A closed loop: two frames of the robot that coincide, as a joint that the tree of the file leaves out keeps them.
+    """A closed loop: two frames of the robot coincide, at a joint that the tree of the robot's file leaves out.
 
-    `type`: point for their origins (a ball joint, and a pin between parallel ones), weld for their axes too. `max_gap`
-    [m] and `max_angle` [rad]: rms distance over a log up to which they count as together.
+    `type`: point: their origins coincide (ball joint, or a pin between parallel pins); weld: their axes too. `max_gap`
+    [m] and `max_angle` [rad]: largest rms error over a log.
     """
 
     frames: Frames
@@ -66,7 +66,7 @@ class LoopConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class RobotFile:
-    """A robot's file, `urdf` or `mjcf`: one of both."""
+    """A robot's file: either `urdf` or `mjcf`."""
 
     urdf: Path | None = None
     mjcf: Path | None = None
@@ -78,7 +78,7 @@ class RobotFile:
 
 
 def require_one_file(robot: RobotFile) -> None:
-    """Refuse a robot of no file or of two. Raises ConfigError: names both keys."""
+    """Refuse a robot without a file or with two. Raises ConfigError: names both keys."""
     if (robot.urdf is None) == (robot.mjcf is None):
         reason = "missing" if robot.urdf is None else "set together with robot.mjcf"
         raise ConfigError.at_field("robot.urdf", reason, "a path to a URDF, or robot.mjcf: a path to a MuJoCo model")
@@ -94,17 +94,12 @@ def require_kind(robot: RobotFile) -> None:
     if is_mjcf(robot.path) != (robot.mjcf is not None):
         key, other = ("robot.urdf", "mjcf") if robot.mjcf is None else ("robot.mjcf", "urdf")
         accepted = f"robot: {{{other}: {robot.path.name}}}"
-        raise ConfigError.at_field(key, f"'{robot.path}', no {key[6:].upper()}", accepted)
+        raise ConfigError.at_field(key, f"'{robot.path}' is not {key[6:].upper()}", accepted)
 
 
 @dataclass(config=STRICT, frozen=True)
 class ConstrainedRobot(RobotFile):
-    """A robot's file, and constraints and missing motors of its joints that the file may not state.
-
-    `weld`: names or patterns of joints that are held still, at 0 or at the position [rad or m] that a mapping gives.
-    `loops`: closed loops beside those of an MJCF file. `passive`: names or patterns of joints without a motor, whose
-    torque is 0; None for those that no actuator of an MJCF file with loops drives.
-    """
+    """A robot's file, with constraints and missing motors of its joints; see `RobotConfig`."""
 
     weld: Welds = dataclasses.field(default_factory=dict)
     loops: list[LoopConfig] = dataclasses.field(default_factory=list)
@@ -113,11 +108,19 @@ class ConstrainedRobot(RobotFile):
 
 @dataclass(config=STRICT, frozen=True)
 class RobotConfig(ConstrainedRobot):
-    """The robot, `urdf` or `mjcf`; `base_link` defaults to the URDF's root.
+    """The robot.
 
-    `mjcf`: a MuJoCo model, read by MuJoCo (the extra [sim]); its tree of most degrees of freedom is the robot.
-    `base_tilt`: two angles [rad] about the base's x and y axes by which it is turned from the base that logs record, as
-    on a table that is not level; auto, those that leave least of the training logs; None for none.
+    Attributes:
+        urdf: path to its URDF.
+        mjcf: path to a MuJoCo model (extra [sim]); the tree with most degrees of freedom is the robot.
+        weld: names or patterns of joints that are held still, at 0 or at a stated position [rad or m].
+        loops: closed loops in addition to those of an MJCF file.
+        passive: names or patterns of joints without a motor (zero torque); null: those without an actuator in an MJCF
+            file with loops.
+        base_link: base of a URDF; null: its root.
+        fixed_base: whether the base stands still.
+        base_tilt: angles about the base's x and y axes from the base in the logs to the base of the file [rad], as on a
+            table that is not level; auto: those with the smallest error on the training logs; null: none.
     """
 
     base_link: str | None = None
@@ -156,13 +159,16 @@ PerAxis = Annotated[
 
 @dataclass(config=STRICT, frozen=True)
 class ContactConfig:
-    """A contact at a URDF frame: `line_axis` is the frame's axis that a line contact runs along.
+    """A contact at a frame of the robot.
 
-    `radius` [m]: a point is a sphere, a line a cylinder about the frame's origin, which rolls; auto: that of the
-    collision sphere or wheel or the ball at the end of a mesh (of a line: the cylinder) in the URDF, 0 without one; but
-    for points a ball about the origin if that predicts the training logs clearly better.
-    `centre` [m]: of the sphere in the frame; auto: of the shape whose radius is taken, else the origin. `normal`: of
-    the ground, in the world, where the logs do not record it (`contact_normal_world`); None for upwards.
+    Attributes:
+        frame: its name.
+        type: point: a force; line: all but the moment about the line; flat: force and moment.
+        line_axis: axis of the frame along a line contact.
+        radius: of a rolling sphere (point) or cylinder (line) [m]. auto: of the sphere, wheel, cylinder, or ball of a
+            mesh in the robot's file, 0 without one; of a point: of a ball about the origin, if that predicts better.
+        centre: of the sphere in the frame [m]; auto: of the shape that gives the radius, else the origin.
+        normal: of the ground in the world, if logs do not record it (`contact_normal_world`); null: upwards.
     """
 
     frame: str
@@ -175,12 +181,11 @@ class ContactConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class NoiseConfig:
-    """Standard deviations of the sensors [N m, N, N m], floors of the base rows [N, N m], and noise of the motion.
+    """Standard deviations of sensors, of errors of the base rows (`base_`), and of the recorded motion.
 
-    None: estimated from the training logs (`torchid.fitting.noise`), or those of `SensorNoise` where there are none;
-    that of joint torques for all joints, or by pattern of their names; that of the motion, in every recorded sample
-    [rad or m, rad/s or m/s, rad, rad/s, m/s^2], from the high frequencies of each log (`torchid.logs.signal_noise`), 0
-    for none.
+    null: estimated from the training logs (`torchid.fitting.noise`; noise of the motion from the high frequencies of
+    each log, `torchid.logs.signal_noise`), or the defaults of `SensorNoise` without logs. 0: no noise of the motion.
+    `joint_torque`: of all joints, or by name or pattern.
     """
 
     joint_torque: PerJoint | None = None
@@ -209,11 +214,7 @@ class NoiseConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class ChoiceConfig:
-    """A named set, or sensors by name; `full` is short for `{set: full}`.
-
-    `ft_sensors`, the fixed joints that carry a force/torque sensor, may be given with a named set too. `fn`, alone
-    among the components of a contact, is the force along the ground's normal, `contact_force_normal` of the logs.
-    """
+    """A named set of sensors, or sensors by name, as under `sensors`. `full` is short for `{set: full}`."""
 
     set: Literal["full", "contacts", "joints"] | None = None
     joint_torques: list[str] = dataclasses.field(default_factory=list)
@@ -253,11 +254,18 @@ SCOPES_ACCEPTED = f"log, all, or a mapping from kinds of channels ({', '.join(CH
 
 @dataclass(config=STRICT, frozen=True)
 class SensorsConfig(ChoiceConfig):
-    """The sensors of a run, their noise and calibration, and whether to stop where they lose the base.
+    """Sensors of a run, their noise and calibration.
 
-    `offsets` and `scales` say which channels have an unknown one, constant over a `log` or over `all`; a scope alone is
-    short for every kind of channel. `scales` may have groups of joints or frames, by names or patterns, that share one.
-    `gain_error`: standard deviation of the gain of each torque sensor that standard errors count, 0.02 for 2 %.
+    Attributes:
+        set: joint torque and contact sensors (full), contact sensors (contacts), or joint torque sensors (joints).
+        joint_torques: joints with a torque sensor.
+        contact_wrenches: measured components by contact; `fn` alone: the normal force (`contact_force_normal`).
+        ft_sensors: fixed joints with a force/torque sensor; may be combined with a named set.
+        noise: standard deviations.
+        offsets: channels with an unknown offset, for each `log` or for `all`; a scope alone: every kind of channel.
+        scales: channels with an unknown scale, likewise; or groups of joints or frames that share one scale.
+        gain_error: standard deviation of the gain of each torque sensor; standard errors include it. 0.02 is 2 %.
+        on_base_lost: stop (error) or warn if the sensors do not determine the base in a contact state.
     """
 
     noise: NoiseConfig = dataclasses.field(default_factory=NoiseConfig)
@@ -280,7 +288,7 @@ Sensors = Annotated[SensorsConfig, BeforeValidator(spelled_out)]
 
 
 def validate_choice(field: str, sensors: ChoiceConfig, may_be_empty: bool = False) -> None:
-    """Refuse a named set together with sensors by name, a sensor named twice, and a choice without any.
+    """Refuse a named set together with sensors by name, a sensor named twice, and an empty choice.
 
     Raises:
         ConfigError: one of these.
@@ -292,7 +300,7 @@ def validate_choice(field: str, sensors: ChoiceConfig, may_be_empty: bool = Fals
     for key, names in named.items():
         twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
         if twice is not None:
-            raise ConfigError.at_field(f"{field}.{key}", f"'{twice}' named twice", "each once")
+            raise ConfigError.at_field(f"{field}.{key}", f"'{twice}' is named twice", "each name once")
     if sensors.empty and not may_be_empty:
         accepted = "full, contacts, joints, or joint_torques, contact_wrenches and ft_sensors by name"
         raise ConfigError.at_field(field, "no sensor", accepted)

@@ -51,7 +51,7 @@ def check_yaml(text: str) -> None:
         if isinstance(event, yaml.AliasEvent):
             aliases += 1
             if any(anchored) or aliases > _MAX_ALIASES:
-                raise ValueError(f"'*{excerpt(str(event.anchor))}' within what has a name, or {_MAX_ALIASES} aliases")
+                raise ValueError(f"'*{excerpt(str(event.anchor))}' inside an anchor, or over {_MAX_ALIASES} aliases")
         elif isinstance(event, yaml.CollectionStartEvent):
             anchored.append(event.anchor is not None)
             if len(anchored) > MAX_DEPTH:
@@ -69,7 +69,7 @@ def _check_node(event: yaml.Event) -> None:
         check_text(event.value)
     tag = getattr(event, "tag", None)
     if tag not in (None, "!"):
-        raise ValueError(f"the tag '{excerpt(tag)}', which settings have no use for")
+        raise ValueError(f"the tag '{excerpt(tag)}' is not supported")
 
 
 class _SettingsLoader(_LOADER):  # type: ignore[misc]
@@ -106,11 +106,11 @@ def check_text(value: str) -> None:
         ValueError: what was found.
     """
     if len(value) > MAX_TEXT:
-        raise ValueError(f"a text of {len(value)} characters, more than {MAX_TEXT}")
+        raise ValueError(f"a text of {len(value)} characters (at most {MAX_TEXT})")
     if not is_plain(value.replace("\n", "")):
-        raise ValueError(f"'{excerpt(value)}', with a control character")
+        raise ValueError(f"'{excerpt(value)}' has a control character")
     if "${" in value:
-        raise ValueError(f"'{excerpt(value)}', but ${{...}} stands for nothing here")
+        raise ValueError(f"'{excerpt(value)}': ${{...}} is not supported")
 
 
 def explain_syntax(error: yaml.MarkedYAMLError, text: str, wanted: str) -> tuple[str, str]:
@@ -123,10 +123,10 @@ def explain_syntax(error: yaml.MarkedYAMLError, text: str, wanted: str) -> tuple
     where = f"line {mark.line + 1}"
     shown = excerpt(line.strip())
     if "\t" in line[: len(line) - len(line.lstrip())]:
-        return f"{where}: a tab before '{shown}'", "spaces in front of a key"
+        return f"{where}: a tab before '{shown}'", "spaces before a key"
     begins = line[mark.column : mark.column + 1]
     if _CANNOT_BEGIN in str(error.problem) and begins in _RESERVED:
-        return f"{where}: '{excerpt(begins)}', which no value begins with, in '{shown}'", "such a value in quotes"
+        return f"{where}: a value cannot begin with '{excerpt(begins)}', in '{shown}'", "the value in quotes"
     why = f"{error.problem} {error.context}" if error.context else str(error.problem)
     if error.context_mark is not None and error.context_mark.line != mark.line:
         why += f" from line {error.context_mark.line + 1} on"
@@ -229,15 +229,15 @@ def _load(kind: FileKind[T], path: Path | None, overrides: Sequence[str], sectio
         try:
             settings = _merged(kind, settings, _from_here(kind, {key: value}))
         except TypeError as error:
-            raise ConfigError.at_field(key, f"found {_repr(value)}", f"what a YAML {kind.name} file takes") from error
+            raise ConfigError.at_field(key, f"found {_repr(value)}", f"a value of a YAML {kind.name} file") from error
     for text in overrides:
         with about_file("command line"):
             given = _from_here(kind, _parsed(text))
         try:
             settings = _merged(kind, settings, given)
         except TypeError as error:
-            accepted = f"key.subkey=value, a list as a whole: '{kind.list_example}'"
-            raise ConfigError("command line", excerpt(text), "does not fit the file", accepted) from error
+            accepted = f"key.subkey=value; a whole list: '{kind.list_example}'"
+            raise ConfigError("command line", excerpt(text), "does not match the file", accepted) from error
     try:
         return TypeAdapter(kind.settings).validate_python(settings)
     except ValidationError as error:
@@ -290,14 +290,14 @@ def _read(kind: FileKind[T], path: Path) -> Settings:
 
 def _no_settings(kind: FileKind[T], path: Path, reason: str, accepted: str) -> ConfigError:
     if path.suffix.lower() in READABLE:
-        return ConfigError(path, "file", f"a log, not a file of settings ({kind.keys})", f"a YAML {kind.name} file")
+        return ConfigError(path, "file", f"a log, not a settings file ({kind.keys})", f"a YAML {kind.name} file")
     return ConfigError(path, "YAML", reason, accepted)
 
 
 def _why(error: Exception) -> str:
     """The cause of an error in reading YAML, in the words of its reader where these are made for users."""
     if isinstance(error, UnicodeDecodeError):
-        return "no text"
+        return "not a text file"
     spoken = isinstance(error, (yaml.YAMLError, ValueError))
     return excerpt(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
 
@@ -305,14 +305,14 @@ def _why(error: Exception) -> str:
 def _parsed(text: str) -> Settings:
     key, equals, value = text.partition("=")
     if not equals:
-        raise ConfigError.at_field(excerpt(text), "not an override", "key.subkey=value")
+        raise ConfigError.at_field(excerpt(text), "not a setting", "key.subkey=value")
     try:
         check_yaml(key)
         check_yaml(value)
         if key.count(".") + key.count("[") > MAX_DEPTH:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         if not _KEY.fullmatch(key):
-            raise ValueError(f"'{excerpt(key)}', no key")
+            raise ValueError(f"'{excerpt(key)}' is not a key")
         settings = load_yaml(value)
         for name in reversed(re.split(r"[.\[]", key.replace("]", ""))):
             settings = {name: settings}
@@ -347,12 +347,12 @@ def _absolute_at(value: Any, key: Sequence[str], folder: Path) -> Any:
 def _absolute_path(value: str, folder: Path) -> str:
     """Raises ValueError or RuntimeError (the home folder of nobody) where the value names no file."""
     if "://" in value:
-        raise ValueError(f"'{excerpt(value)}', a URL (download it first, with curl)")
+        raise ValueError(f"'{excerpt(value)}' is a URL (download it first)")
     path = os.path.normpath(folder / Path(value).expanduser())
     names = [len(os.fsencode(name)) for name in Path(path).parts]
     too_long = max(names) > _LONGEST_NAME or sum(names) + len(names) > _LONGEST_PATH
     if not value.strip() or not Path(path).name or not is_plain(value) or too_long:
-        raise ValueError(f"'{excerpt(value)}', no name for a file or folder")
+        raise ValueError(f"'{excerpt(value)}' is not a file or folder name")
     return path
 
 
@@ -480,5 +480,5 @@ def _plain(value: object, field: str, depth: int) -> Any:
         return str(value)
     if value is None or isinstance(value, (bool, int, float)):
         return value
-    accepted = f"{_ACCEPTED}; torchid.write_log makes a file of a Log" if isinstance(value, Log) else _ACCEPTED
+    accepted = f"{_ACCEPTED}; write a Log to a file with torchid.write_log" if isinstance(value, Log) else _ACCEPTED
     raise ConfigError.at_field(field, f"found {excerpt(' '.join(repr(value).split()))}", accepted)

@@ -20,14 +20,14 @@ Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 @dataclass(config=STRICT, frozen=True)
 class SimulatedRobotConfig(ConstrainedRobot):
-    """The true robot, `urdf` or `mjcf`: its base is the URDF's root, or the body with the free joint."""
+    """The true robot, `urdf` or `mjcf`. Its base is the URDF's root, or the body with the free joint."""
 
 
 @dataclass(config=STRICT, frozen=True)
 class FootConfig:
-    """A URDF frame that touches the floor at `points` [m], by default its link's collision spheres.
+    """A foot: its URDF `frame`, and its contact `points` [m], by default the collision spheres of its link.
 
-    `sensor`: what the foot reads, its whole wrench, or `fn`, the force along the floor's normal alone.
+    `sensor`: wrench: the whole wrench; fn: the force along the floor's normal.
     """
 
     frame: str
@@ -39,7 +39,7 @@ class FootConfig:
 class WaveConfig:
     """A sine: `what` is com_x, com_y, com_z [m], base_roll, base_pitch, base_yaw [rad] or a joint [rad or m].
 
-    `phase` is in turns.
+    `amplitude` has its unit, `phase` is in turns.
     """
 
     what: str
@@ -50,9 +50,9 @@ class WaveConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class StepsConfig:
-    """Feet lifted in turn: foot i of k in `order` is highest at (i + 1/2)/k of every period of 1/hz.
+    """Feet are lifted in turn: foot i of k in `order` is highest at (i + 1/2)/k of every period 1/hz.
 
-    `swing_s` is the time in the air, `transfer_s` that in which the load leaves the foot before, or comes back after.
+    `swing_s`: time in the air. `transfer_s`: time in which the load leaves the foot, and in which it returns.
     """
 
     hz: Positive
@@ -64,7 +64,7 @@ class StepsConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class MotionConfig:
-    """One log: waves about the stance, and steps. `name` becomes the name of the file."""
+    """One log: waves about the stance, and steps. `name` is the name of its file, `duration_s` its length [s]."""
 
     name: FileName
     duration_s: Annotated[Positive, Field(le=3600.0)]
@@ -74,7 +74,7 @@ class MotionConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class WhiteNoiseConfig:
-    """White noise of every sample, standard deviations [rad or m, m, rad, N m or N, N, N m]."""
+    """White noise of every sample: standard deviations [rad or m, m, rad, N m or N, N, N m]."""
 
     enabled: bool = False
     joint_position: NotNegative = 1e-4
@@ -87,7 +87,7 @@ class WhiteNoiseConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class BiasConfig:
-    """An offset [N m, N, N m] and a gain error of every force channel, the same in all logs: standard deviations."""
+    """Constant errors of every force channel, the same in all logs: standard deviations [N m, N, N m, 1]."""
 
     enabled: bool = False
     joint_torque: NotNegative = 1.0
@@ -98,7 +98,7 @@ class BiasConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class DelayConfig:
-    """The delay of the foot sensors [s]."""
+    """Delay of the foot sensors, `feet_s` [s]."""
 
     enabled: bool = False
     feet_s: NotNegative = 0.01
@@ -106,7 +106,7 @@ class DelayConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class FrictionConfig:
-    """Friction of every joint [N m, N m s/rad]; when off, the URDF's."""
+    """Friction of every joint [N m, N m s/rad]. If not enabled: the URDF's."""
 
     enabled: bool = False
     coulomb: NotNegative = 1.0
@@ -120,7 +120,7 @@ class FrictionConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class SensorImperfectionsConfig:
-    """Errors of the sensors; a contact is active while its measured load exceeds a threshold [N]."""
+    """Errors of the sensors. A contact is active while its measured load exceeds `contact_threshold` [N]."""
 
     noise: WhiteNoiseConfig = dataclasses.field(default_factory=WhiteNoiseConfig)
     bias: BiasConfig = dataclasses.field(default_factory=BiasConfig)
@@ -130,9 +130,9 @@ class SensorImperfectionsConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class BoundsConfig:
-    """Limits of a motion [m]: of base height from the stance's, of slipping feet, of the zero-moment point.
+    """Limits of a motion [m]: change of base height, slip of a foot, position of the zero-moment point.
 
-    `zmp_m` is the least distance from the zero-moment point to the border of the support polygon.
+    `zmp_m`: smallest distance from the zero-moment point to the border of the support polygon.
     """
 
     height_m: Positive = 0.2
@@ -142,7 +142,7 @@ class BoundsConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class NominalConfig:
-    """The nominal robot: mass, centre of mass and inertia of every body off by up to `error`, as a share."""
+    """The nominal robot. `error`: error of mass, centre of mass and inertia of each body, as a share."""
 
     error: BelowOne = 0.2
     seed: Seed = 0
@@ -194,9 +194,9 @@ def load_simulation(path: str | Path, overrides: Sequence[str] = ()) -> Simulati
         require_one_file(config.robot)
     ratio = config.physics_hz / config.control_hz
     if abs(ratio - max(round(ratio), 1)) > 1e-9:
-        raise ConfigError(path, "control_hz", f"{config.control_hz:g}", f"{config.physics_hz:g} over a whole number")
+        raise ConfigError(path, "control_hz", f"{config.control_hz:g}", f"{config.physics_hz:g} / a whole number")
     names = [motion.name for motion in config.motions]
     again = [name for name in names if names.count(name) > 1]
     if again:
-        raise ConfigError(path, "motions", f"several named '{again[0]}'", "a name of its own for every motion")
+        raise ConfigError(path, "motions", f"several named '{again[0]}'", "different names")
     return config
