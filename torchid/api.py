@@ -76,7 +76,7 @@ def evaluate(
             if not write:
                 return evaluate_identification(run, paths, device)
             if run.experiment.config.output is None:
-                raise ConfigError.at_field("write", "True, of a run without a folder", "run.write(folder) before")
+                raise ConfigError.at_field("write", "True, but the run has no folder", "run.write(folder) first")
             run = run.experiment.config.output
         return evaluate_folder(Path(run), paths, device, write)
 
@@ -113,22 +113,22 @@ def check(what: Log | StrPath | None = None, *of_log: Any, **sections: Any) -> C
     """Check logs for errors, as `torchid check` does.
 
     Args:
-        what: an experiment file; a log file, by itself or with `robot`; a `Log`; or None: the keywords say all.
-        of_log: of a `Log`: robot, contacts, cutoff_hz and derived, see `torchid.log_checks.check.check`.
-        sections: as for `identify`; of a log file `robot` alone.
+        what: an experiment file; a log file, alone or with `robot`; a `Log`; or None: keywords only.
+        of_log: for a `Log`: robot, contacts, cutoff_hz and derived, see `torchid.log_checks.check.check`.
+        sections: as for `identify`; for a log file only `robot`.
 
     Raises:
-        InputError: a log that cannot be read, or whatever does not fit.
+        InputError: a log that cannot be read, or invalid input.
     """
     if isinstance(what, Log):
         return check_samples(what, *of_log, **sections)
     if of_log:
-        raise TypeError("check: robot and contacts by position go with a Log; of files they are keywords")
+        raise TypeError("check: only a Log takes positional robot and contacts; for files use keywords")
     with _about("check", what):
         if what is None or Path(what).suffix.lower() in EXPERIMENTS:
             return CheckedLogs(check_experiment(_path(what), (), sections))
         if other := sections.keys() - {"robot"}:
-            raise UnknownNameError.at_field("key", min(other), ("robot",), "which goes with an experiment")
+            raise UnknownNameError.at_field("key", min(other), ("robot",), "which needs an experiment file")
         robot = plain_sections(sections).get("robot", {})
         robot = {"urdf": robot} if isinstance(robot, str) else robot
         if not isinstance(robot, Mapping) or not robot.keys() <= _OF_LOG or (robot and len(_FILES & robot.keys()) != 1):
@@ -139,7 +139,7 @@ def check(what: Log | StrPath | None = None, *of_log: Any, **sections: Any) -> C
 
 @contextmanager
 def _about(function: str, file: StrPath | None) -> Iterator[None]:
-    """Let errors be about the file, or the function where there is none."""
+    """Let errors name the file, or the function without one."""
     with about_file(f"torchid.{function}" if file is None else file):
         yield
 

@@ -18,17 +18,17 @@ from torchid.errors import ConfigError, during
 from torchid.parallel import forks_allowed
 
 _IDENTIFY = "fit a robot to the logs of an experiment file and write a run folder"
-_COMPRESS = "compress the training logs of an experiment file to small files, which identify fits in their place"
+_COMPRESS = "compress the training logs of an experiment file to small files that identify can fit instead"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
-_REPLAY = "drive the robot in MuJoCo with the torques of a log, and say how far it drifts (extra [sim])"
-_EXPORT = "write the identified parameters of a run for a simulator: MJCF, URDF, Isaac Lab's actuators, or JSON"
-_SAMPLE = "draw robots from what the logs of a run leave open, for domain randomization"
-_REPORT = "make report.html of a run anew, with what the checks of its logs find"
-_ANALYZE = "say what sensors and motion can determine, and find the smallest sensor set"
-_INIT = "write an experiment file for a robot and a log; what is not sure is listed, to be filled in"
+_REPLAY = "drive the robot in MuJoCo with the torques of a log, and report its drift (extra [sim])"
+_EXPORT = "write the identified parameters of a run for a simulator: MJCF, URDF, actuators of Isaac Lab, or JSON"
+_SAMPLE = "draw robots within the uncertainty of a run, for domain randomization"
+_REPORT = "write report.html of a run again, with the findings of the log checks"
+_ANALYZE = "report what sensors and motion can determine, and find the smallest sensor set"
+_INIT = "write an experiment file for a robot and a log; you fill in what is uncertain"
 _DEMO = "identify the demo's quadruped, or copy the examples that ship with torchid"
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
-_CHECK = "say what is wrong with logs, and what to do"
+_CHECK = "find mistakes in logs, and say what to do"
 _SIMULATE = "simulate a robot and write the logs of its sensors (extra [sim])"
 _FIRST_STEPS = """first steps with a robot of your own:
   torchid init robot.urdf walk.csv --output robot.yaml
@@ -39,12 +39,12 @@ torchid COMMAND --help lists the options of a command."""
 _SHELLS = ("bash", "zsh")
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 _SHARED = ("identify", "compress", "evaluate", "analyze")
-"""By the processes that torchrun has started; the first runs all others."""
+"""Commands that torchrun processes share; the first process runs all others."""
 _WITHOUT_LOGS = ("export", "simulate", "sample")
 
 
 def run() -> NoReturn:
-    """Run the command of the command line as a process of its own, which then ends at once: in order takes 0.3 s."""
+    """Run the command and end the process at once, as an orderly end takes 0.3 s."""
     open_closed_streams()
     end_process(main())
 
@@ -116,7 +116,7 @@ def _add_fits(commands: _Commands) -> None:
     """Commands that take an experiment file: before a fit, and the fit."""
     check = commands.add_parser("check", help=_CHECK, description=_CHECK)
     _add_file(check, "experiment file (YAML), or a log", "with an experiment file")
-    check.add_argument("--urdf", metavar="FILE", help="robot of a log, URDF or MJCF; without it checks are fewer")
+    check.add_argument("--urdf", metavar="FILE", help="robot of a log, URDF or MJCF; without it there are fewer checks")
     check.add_argument("--base-link", metavar="LINK", help="base of that robot, if it is not the URDF's root")
     check.add_argument("--fixed-base", action="store_true", help="the base of that robot is fixed")
     _add_maps(check)
@@ -143,11 +143,11 @@ def _add_uses_of_runs(commands: _Commands) -> None:
     replay = commands.add_parser("replay", help=_REPLAY, description=_REPLAY)
     replay.add_argument("run", help="run folder")
     replay.add_argument("--log", required=True, metavar="FILE", help="log whose joint torques drive the robot")
-    replay.add_argument("--window", type=float, default=0.5, metavar="S", help="seconds from each state (default: 0.5)")
-    for option, what in (("--kp", "of positions"), ("--kd", "of velocities")):
-        text = f"gains {what} of the PD law that made the torques: 20, '*_calf=30' (default: 0)"
+    replay.add_argument("--window", type=float, default=0.5, metavar="S", help="length of a replay [s] (default: 0.5)")
+    for option, what in (("--kp", "position"), ("--kd", "velocity")):
+        text = f"{what} gains of the PD law behind the torques: 20, '*_calf=30' (default: 0)"
         replay.add_argument(option, nargs="+", default=[], metavar="GAIN", help=text)
-    replay.add_argument("--samples", type=int, default=10, metavar="N", help="drawn robots to replay too (default: 10)")
+    replay.add_argument("--samples", type=int, default=10, metavar="N", help="sampled robots to replay (default: 10)")
     replay.add_argument("--output", metavar="FOLDER", help="folder to write: a figure and all numbers")
     replay.add_argument("--overwrite", action="store_true", help="replace an earlier replay in this folder")
     _add_amount(replay)
@@ -167,11 +167,11 @@ def _add_uses_of_runs(commands: _Commands) -> None:
 def _add_sample(commands: _Commands) -> None:
     sample = commands.add_parser("sample", help=_SAMPLE, description=_SAMPLE)
     sample.add_argument("run", help="run folder")
-    sample.add_argument("--count", type=int, metavar="N", help="number of sets (default: 10000, of robots' files 20)")
-    what = "arrays with names, a file of the robot for each set, or ranges and correlations (default: by --output)"
+    sample.add_argument("--count", type=int, metavar="N", help="number of samples (default: 10000; robot files: 20)")
+    what = "named arrays, a robot file for each sample, or ranges and correlations (default: by --output)"
     sample.add_argument("--format", choices=SAMPLE_FORMATS, help=what)
-    sample.add_argument("--output", metavar="FILE", help="FILE.npz, FILE.json, or a folder for robots' files")
-    prior = "how far off the robot file may be: as a share of each body; auto: as the data say (default: 0.2)"
+    sample.add_argument("--output", metavar="FILE", help="FILE.npz, FILE.json, or a folder for robot files")
+    prior = "relative error of each body in the robot's file; auto: estimated from the data (default: 0.2)"
     sample.add_argument("--prior-error", default="0.2", metavar="SHARE", help=prior)
     sample.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
     sample.add_argument("--overwrite", action="store_true", help="replace what exists there")
@@ -182,7 +182,7 @@ def _add_sample(commands: _Commands) -> None:
 def _add_studies(commands: _Commands) -> None:
     """Commands that need no recorded log."""
     analyze = commands.add_parser("analyze", help=_ANALYZE, description=_ANALYZE)
-    _add_file(analyze, "experiment file (YAML), also without logs", "as analysis.candidates.contacts=axis")
+    _add_file(analyze, "experiment file (YAML), also without logs", "for example analysis.candidates.contacts=axis")
     analyze.set_defaults(command=_analyze)
     simulate = commands.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
     _add_file(simulate, "simulation file (YAML)", "for example sensors.bias.enabled=true")
@@ -190,13 +190,13 @@ def _add_studies(commands: _Commands) -> None:
 
 
 def _add_maps(command: argparse.ArgumentParser) -> None:
-    """Options that say what is in a foreign log."""
+    """Options that describe a foreign log."""
     command.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
     command.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
 
 
 def _add_work_on_logs(commands: _Commands) -> None:
-    """Commands that write logs anew."""
+    """Commands that convert logs."""
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
     read = "log: .npz, .h5, .mat, .json, .csv, .txt, .parquet, .jsonl, .mot, .sto, or a bag of ROS messages"
     convert.add_argument("source", metavar="IN", help=read)
@@ -211,7 +211,7 @@ def _add_work_on_logs(commands: _Commands) -> None:
 
 
 def _add_starts(commands: _Commands) -> None:
-    """Commands that one begins with."""
+    """First commands of a user."""
     demo = commands.add_parser("demo", help=_DEMO, description=_DEMO)
     demo.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, as of identify")
     place = demo.add_mutually_exclusive_group()
@@ -227,9 +227,9 @@ def _add_starts(commands: _Commands) -> None:
         help="table, arrays or bag: .csv, .txt, .parquet, .jsonl, .mot, .sto, .npz, .h5, .mat, .json, .mcap, .db3, "
         ".bag; or several, 'FILE + FILE@SECONDS'",
     )
-    what = "file to write, a new one (default: experiment.yaml)"
+    what = "new file to write (default: experiment.yaml)"
     init.add_argument("--output", default="experiment.yaml", metavar="FILE", help=what)
-    init.add_argument("--total-mass", type=float, metavar="KG", help="of the robot, if it is known, as from a scale")
+    init.add_argument("--total-mass", type=float, metavar="KG", help="mass of the robot, if known from a scale")
     init.set_defaults(command=_init)
 
 
@@ -256,7 +256,7 @@ def _add_file(command: argparse.ArgumentParser, what: str, example: str) -> None
 
 def _add_amount(command: argparse.ArgumentParser) -> None:
     amount = command.add_mutually_exclusive_group()
-    amount.add_argument("--verbose", "-v", action="store_true", help="print all tables, not the answer alone")
+    amount.add_argument("--verbose", "-v", action="store_true", help="print all tables")
     amount.add_argument("--quiet", "-q", action="store_true", help="print nothing but warnings and errors")
 
 

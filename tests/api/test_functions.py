@@ -177,10 +177,10 @@ def test_logs_are_checked_from_files_and_from_memory(demo: Path, capsys: pytest.
         ),
         ({"sensors": {"joint_torques": ["nee"]}}, UnknownNameError, "torchid.identify: sensors.joint_torques: unknown"),
         ({"logs": [object()]}, ConfigError, "torchid.identify: logs.0: found <object"),
-        ({"logs": {"train": [LOG]}}, ConfigError, "experiment file; torchid.write_log makes a file of a Log"),
+        ({"logs": {"train": [LOG]}}, ConfigError, "experiment file; write a Log to a file with torchid.write_log"),
         ({"robot": None}, ConfigError, "torchid.identify: robot: found None; accepted: a mapping with urdf"),
         ({"overwrite": "often"}, ConfigError, "torchid.identify: overwrite: found 'often'"),
-        ({"resume": True, "estimator": {"name": "sgd"}}, ConfigError, "--resume: set, without an output; accepted: an"),
+        ({"resume": True, "estimator": {"name": "sgd"}}, ConfigError, "--resume: needs an output; accepted: an"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
@@ -196,16 +196,16 @@ def test_a_missing_keyword_is_named(result: torchid.Identification) -> None:
         torchid.identify(robot=DEMO / "quadruped.urdf")
     with pytest.raises(ConfigError, match="^torchid.check: logs: missing; accepted: logs to check"):
         torchid.check(robot=DEMO / "quadruped.urdf")
-    with pytest.raises(ConfigError, match="^torchid.evaluate: logs: none; accepted: logs to evaluate"):
+    with pytest.raises(ConfigError, match="^torchid.evaluate: logs: none given; accepted: logs to evaluate"):
         torchid.evaluate(result, [])
     for device in ("tpu", "cuda:x", "cuda:99"):
         with pytest.raises(
             ConfigError, match=f"^torchid.evaluate: device: '{device}' is not available on this machine; acc"
         ):
             torchid.evaluate(result, DEMO / "sway_test.npz", device=device)
-    with pytest.raises(ConfigError, match="^torchid.evaluate: write: True, of a run without a folder; accepted: run.w"):
+    with pytest.raises(ConfigError, match="^torchid.evaluate: write: True, but the run has no folder; accepted: run.w"):
         torchid.evaluate(result, DEMO / "sway_test.npz", write=True)
-    with pytest.raises(UnknownNameError, match="sway_test.npz: key: 'logs', which goes with an experiment"):
+    with pytest.raises(UnknownNameError, match="sway_test.npz: key: 'logs', which needs an experiment file"):
         torchid.check(DEMO / "sway_test.npz", logs=[])
     with pytest.raises(ConfigError, match="sway_test.npz: robot: found {'base_link': 'a'}; accepted: a URDF, or a map"):
         torchid.check(DEMO / "sway_test.npz", robot={"base_link": "a"})

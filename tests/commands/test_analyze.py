@@ -162,7 +162,7 @@ REFUSED = {
     ),
     "a set to compare without a name": ({"compare": {"": "full"}}, "analysis.compare", "accepted: a name"),
     "a set to compare with a sensor at no fixed joint": (
-        {"compare": {"limb": {"ft_sensors": ["hip"]}}}, "analysis.compare", "without logs to predict accuracy from",
+        {"compare": {"limb": {"ft_sensors": ["hip"]}}}, "analysis.compare", "needs logs to measure accuracy",
     ),
 }  # fmt: skip
 
@@ -245,7 +245,7 @@ def test_sensors_in_limbs_are_planned_named_and_drawn(experiment: Path) -> None:
 
 def test_an_output_without_a_name_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
     message = refusal(["analyze", str(asked(experiment, output="/"))], experiment, capsys)
-    assert "no name for a file or folder" in message
+    assert "is not a file or folder name" in message
 
 
 def test_a_robot_that_cannot_move_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -173,10 +173,10 @@ SETTINGS: list[tuple[str, ...]] = [
     ("logs={train: []}", "logs.train", "at least one"),
     ("logs={train: [nowhere.npz]}", "nowhere.npz"),
     ("sensors={joint_torques: [front_left_hip, front_left_thigh]}", "rank(S_b V_x)", "rank 0 of 6"),
-    ("robot.fixed_base=true", "sensors", "no parameter is in reach"),
+    ("robot.fixed_base=true", "sensors", "they determine no parameter"),
     ("preprocessing={sample_rate_hz: 0.01}", "preprocessing.sample_rate_hz", "leaves one sample"),
     ("preprocessing={cutoff_hz: 8, sample_rate_hz: 15}", "preprocessing.sample_rate_hz", "16 Hz"),
-    ("output=quadruped.urdf/run", "output", "no folder can be made"),
+    ("output=quadruped.urdf/run", "output", "cannot create a folder"),
     ("output=" + "x" * 300, "output", "accepted"),
     ("device=CPU", "device", "cuda:0"),
     ("device=cuda:77", "device", "cuda:77"),
@@ -219,7 +219,7 @@ def test_a_log_in_place_of_an_experiment_file_is_told_for_what_it_is(
     experiment: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     line = refusal([command, str(experiment / "sway_train.npz")], experiment.parent, capsys)
-    assert "sway_train.npz: file: a log, not a file of settings" in line
+    assert "sway_train.npz: file: a log, not a settings file" in line
     kind = "simulation" if command == "simulate" else "experiment"
     assert line.endswith(f"accepted: a YAML {kind} file")
 
@@ -307,9 +307,9 @@ URL_KEYS = ["logs.train=[s3://bucket/a.factor]", "logs.test=[memory://bucket/a.n
 @pytest.mark.parametrize("key", [*URL_KEYS, "output=s3://b/run"])
 def test_no_key_takes_a_url(tmp_path: Path, capsys: pytest.CaptureFixture[str], key: str) -> None:
     message = refusal(["identify", str(DEMO / "quadruped.yaml"), key], tmp_path, capsys)
-    assert ", a URL (download it first, with curl); accepted: a path" in message
+    assert "is a URL (download it first); accepted: a path" in message
 
 
 def test_compress_writes_to_no_url(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     message = refusal(["compress", str(DEMO / "quadruped.yaml"), "--output", "s3://bucket/factors"], tmp_path, capsys)
-    assert message.startswith("torchid: s3://bucket/factors: output: a URL; accepted: a folder on this machine")
+    assert message.startswith("torchid: s3://bucket/factors: output: a URL; accepted: a local folder")

@@ -87,8 +87,12 @@ def test_settings_that_contradict_each_other_are_refused(tmp_path: Path) -> None
         return lambda: set_up(load_config(experiment(tmp_path, **preprocessing)))
 
     place = f"{tmp_path / 'run.yaml'}: {KEY}"
-    refused(said(contact_threshold={"above": 10, "below": 20}), f"{place}.below: 20, more than above (10)", ConfigError)
-    refused(said(contact_threshold=10, detect_contacts=True), f"{place}: set together with prepro", ConfigError)
+    refused(
+        said(contact_threshold={"above": 10, "below": 20}),
+        f"{place}.below: 20 N is more than above (10 N)",
+        ConfigError,
+    )
+    refused(said(contact_threshold=10, detect_contacts=True), f"{place}: preprocessing.detect_contacts m", ConfigError)
     refused(said(contact_threshold=-1), f"{place}.above: ", ConfigError)
     refused(said(contact_threshold={"below": 20}), f"{place}.above", ConfigError)
     assert "a force [N], or a mapping" in refused(said(contact_threshold="30N"), f"{place}: found '30N'", ConfigError)
@@ -118,4 +122,4 @@ def test_a_fit_of_zeroed_sensors_is_that_of_sensors_without_offsets(tmp_path: Pa
 def test_offsets_have_one_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = experiment(tmp_path, change=lambda log: log, zero_in_air=True)
     line = refusal(["identify", str(file), "sensors.offsets={contact_moment: log}"], tmp_path, capsys)
-    assert "sensors.offsets.contact_moment: set together with preprocessing.zero_in_air" in line
+    assert "sensors.offsets.contact_moment: preprocessing.zero_in_air subtracts the same" in line

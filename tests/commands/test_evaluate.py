@@ -64,7 +64,7 @@ def test_a_run_gives_the_noise_beside_its_errors(demo: tuple[Path, str]) -> None
     assert found["train"]["projected_residual"] == pytest.approx(0.38, abs=0.01)
     for value in (found["train"]["base_force"], found["test"]["base_moment"]):
         assert f"{value:.4g}" in printed
-    assert printed.count("│   noise alone") == 4
+    assert printed.count("│   noise floor") == 4
 
 
 @UNPHYSICAL
@@ -76,7 +76,7 @@ def test_noise_that_residuals_show_is_no_measure_of_them(tmp_path: Path, capsys:
     (demo / "quadruped.yaml").write_text(text.replace(stated, "noise: {}"))
     assert main(["identify", "--verbose", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
     assert floors(run) == {"train": {}, "test": {}}
-    assert "│   noise alone" not in capsys.readouterr().out
+    assert "│   noise floor" not in capsys.readouterr().out
 
 
 def series(noise: Array | None) -> ForceSeries:

@@ -117,8 +117,9 @@ def test_actuators_that_cannot_be_stand_on_their_bounds_and_are_named(
     settings, output = [f"logs.train={json.dumps(overrides)}"], run.folder / "pushed"
     assert main(["identify", str(run.file), *settings, f"output={output}"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"negative, which nothing is: Coulomb friction of {joint} forwards; estimator.name=consistent" in shown
-    assert "all 9 can exist" in shown, "it is no body's fault"
+    negative = f"The fit makes Coulomb friction of {joint} forwards negative: impossible."
+    assert f"{negative} Use estimator.name=consistent" in shown
+    assert "all 9 physically consistent" in shown, "it is no body's fault"
     (broken,) = json.loads((output / "metrics.json").read_text())["violations"]
     assert (broken["term"], broken["unit"]) == (f"Coulomb friction of {joint} forwards", "N m")
     assert broken["amount"] > 0.1
@@ -126,7 +127,7 @@ def test_actuators_that_cannot_be_stand_on_their_bounds_and_are_named(
     settings += ["estimator.name=consistent", "estimator.ridge=1e-6", "overwrite=true", f"output={output}"]
     assert main(["identify", str(run.file), *settings, "--verbose"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert "|: at a physical bound" in shown
+    assert "|: at a physical limit" in shown
     assert f"Coulomb friction of {joint} forwards" in shown
     metrics, document = (json.loads((output / f"{name}.json").read_text()) for name in ("metrics", "parameters"))
     assert metrics["violations"] == []

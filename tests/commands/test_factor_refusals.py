@@ -74,8 +74,8 @@ def test_factors_of_another_experiment_are_refused_by_name(
 
 
 NEEDS_SAMPLES = {
-    "sgd": ("estimator={name: sgd}", "estimator.name: sgd, but logs.train names factors"),
-    "robust": ("estimator.robust=huber", "estimator.robust: set, but logs.train names factors"),
+    "sgd": ("estimator={name: sgd}", "estimator.name: sgd, but logs.train has factors"),
+    "robust": ("estimator.robust=huber", "estimator.robust: set, but logs.train has factors"),
     "exclusion": (
         "preprocessing.exclude_rejected=true",
         "preprocessing.exclude_rejected: true, but logs.train",
@@ -91,9 +91,12 @@ NEEDS_SAMPLES = {
     "base noise": ("sensors.noise.base_force=[1,2,3]", "sensors.noise.base_force.x: 1, but 0.3 in {fleet}/factors/"),
     "mixed": (
         "logs.train=[{fleet}/factors/sway_test.factor, {fleet}/sway_train.npz]",
-        "logs.train: {fleet}/sway_train.npz beside factors of other logs; accepted: logs alone, or .factor files alone",
+        "logs.train: {fleet}/sway_train.npz is a log, but other entries are factors; accepted: only logs, or only ",
     ),
-    "tests": ("logs.test=[{fleet}/factors/sway_test.factor]", "logs.test: {fleet}/factors/sway_test.factor, factors"),
+    "tests": (
+        "logs.test=[{fleet}/factors/sway_test.factor]",
+        "logs.test: {fleet}/factors/sway_test.factor has factors",
+    ),
 }
 
 
@@ -110,7 +113,7 @@ def test_what_needs_samples_or_other_noise_is_refused_by_name(
 def test_commands_that_need_samples_say_so(fleet: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
     options = ["--output", str(fleet / "out")] if command == "compress" else []
     message = refusal([command, str(fleet / "experiment.yaml"), *options], fleet, capsys)
-    assert f"factors of a log, where torchid {command} needs its samples; accepted: logs (.npz, " in message
+    assert f"has factors, but torchid {command} needs samples; accepted: logs (.npz, " in message
 
 
 def test_files_of_different_noise_or_of_the_same_log_are_refused(
@@ -226,7 +229,7 @@ def test_logs_of_one_name_are_not_compressed_to_one_file(
     shutil.copy(fleet / "sway_test.npz", tmp_path / "sway_train.npz")
     logs = f"logs.train=[{fleet / 'sway_train.npz'}, {tmp_path / 'sway_train.npz'}]"
     line = ["compress", str(fleet / "logs.yaml"), logs, "--output", str(fleet / "out")]
-    assert "several logs that would become sway_train.factor" in refusal(line, fleet, capsys)
+    assert "several logs have the file name sway_train.factor" in refusal(line, fleet, capsys)
 
 
 def rewritten(path: Path, target: Path, change: Callable[[dict[str, Any], dict[str, Any]], None]) -> Path:

@@ -110,7 +110,7 @@ def test_joints_feet_and_units_of_robots_are_found_by_name_and_number(
     np.testing.assert_allclose(
         np.gradient(again.joint_position, again.time, axis=0)[5:-5], again.joint_velocity[5:-5], atol=1e-3
     )
-    assert written.missing == ["motion of the base: neither its pose nor an IMU; taken from the feet that stand"]
+    assert written.missing == ["motion of the base: no pose and no IMU; computed from the standing feet"]
     assert config.preprocessing.base_motion == "contacts"
     set_up(config)
 
@@ -130,15 +130,15 @@ def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["init", str(URDF), str(log), "--output", str(tmp_path / "new.yaml")]) == 0
     shown = capsys.readouterr().out
     for text in (
-        "missing       time: to be filled in, the step between samples",
-        "missing       joint_position: to be filled in, a column or pattern below",
-        "missing       joint_torque: to be filled in, torques [N m]",
-        "missing       motion of the base: neither its pose nor an IMU",
-        "missing       contact_active: which foot touches when; detected from joint torques",
-        "assumed       columns without an entry are listed in the file: a: 1 to 2, b: no numbers",
+        "missing       time: fill in the step between samples",
+        "missing       joint_position: fill in a column or pattern below",
+        "missing       joint_torque: fill in torques [N m]",
+        "missing       motion of the base: no pose and no IMU",
+        "missing       contact_active (which foot touches when): detected from joint torques",
+        "assumed       unused columns, listed in the file: a: 1 to 2, b: no numbers",
     ):
         assert text in shown
-    assert "next: fill in FILL_IN there" in " ".join(shown.split())
+    assert "next: replace FILL_IN there" in " ".join(shown.split())
     message = refusal(["identify", str(tmp_path / "new.yaml")], tmp_path, capsys)
     assert "logs.columns.time.step: found 'FILL_IN'; accepted: a number" in message
 
@@ -150,9 +150,9 @@ def test_nothing_is_ever_replaced_and_nothing_half_written(tmp_path: Path, capsy
     (tmp_path / "bad.npz").write_bytes(b"no archive")
     (tmp_path / "x.mcap").write_bytes(b"")
     for urdf, source, output, found in (
-        (URDF, log, "new.yaml", "--output: exists; accepted: a new file: torchid init replaces none"),
+        (URDF, log, "new.yaml", "--output: exists; accepted: a new file; torchid init overwrites no file"),
         (URDF, log, "link.yaml", "--output: exists"),
-        (URDF, log, "nowhere/new.yaml", "--output: no folder"),
+        (URDF, log, "nowhere/new.yaml", "--output: the folder "),
         (URDF, log, "new.txt", "--output: '"),
         (URDF, tmp_path / "absent.csv", "a.yaml", "absent.csv: file: no such file"),
         (URDF, f"{log} + {DEMO.name}/b.csv", "a.yaml", f"paths of further files are relative to {DEMO}"),

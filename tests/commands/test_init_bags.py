@@ -40,7 +40,7 @@ from torchid.robot import load_robot
 
 URDF = DEMO / "quadruped.urdf"
 TALOS = ROBOTS / "talos_data/robots/talos_reduced.urdf"
-TOO_SHORT = "motion: 0.078 s are too short for a fit"
+TOO_SHORT = "motion: 0.078 s is too short for a fit"
 GO2_URDF = ROBOTS / "go2_description/urdf/go2.urdf"
 COUNTS = np.random.default_rng(2).integers(10, 200, (40, 4))
 pytestmark = pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")  # of frames and of times of receipt
@@ -74,7 +74,7 @@ def test_a_bag_of_every_type_is_read_as_it_was_recorded(tmp_path: Path, capsys: 
     order = [again.contact_names.index(name) for name in log.contact_names]
     np.testing.assert_array_equal(np.asarray(again.contact_active)[:, order], log.contact_active)
     text = path.with_suffix(".yaml").read_text()
-    assert "  topics:  # what the messages of the bag hold: docs/logs.md\n    joint_states: /joint_states\n" in text
+    assert "  topics:  # content of the topics: docs/logs.md\n    joint_states: /joint_states\n" in text
     assert "    # assumed: 'base' is taken for the base link\n    odometry: {" in text
     (tmp_path / "x.yaml").unlink()
     assert main(["init", str(URDF), str(path), "--output", str(tmp_path / "x.yaml")]) == 0
@@ -129,7 +129,7 @@ def test_the_robot_of_a_state_is_that_whose_joints_the_urdf_has(tmp_path: Path, 
     config = load_config(tmp_path / "x.yaml")
     assert len(config.contacts) == feet
     assert config.preprocessing.detect_contacts
-    missing = ["contact_active: which foot touches when; detected from joint torques"]
+    missing = ["contact_active (which foot touches when): detected from joint torques"]
     assert [text for text in said.missing if TOO_SHORT not in text] == missing
 
 
@@ -137,7 +137,7 @@ def test_a_state_of_another_robot_is_not_taken(tmp_path: Path) -> None:
     order = JOINT_ORDERS["g1_23dof"]
     path = write_low_states(tmp_path / "x.mcap", moving(order.names), order.joints, HG)
     said = init(GO2_URDF, path, tmp_path / "x.yaml")
-    assert any(text.startswith("joint_states: to be filled in") for text in said.missing)
+    assert any(text.startswith("joint_states: fill in ") for text in said.missing)
     assert "    #   /lowstate (unitree_hg/msg/LowState)" in (tmp_path / "x.yaml").read_text()
     assert "low_state" not in (tmp_path / "x.yaml").read_text()
 
@@ -222,7 +222,7 @@ def test_commands_other_joints_and_imus_of_limbs_are_left_out(tmp_path: Path) ->
     assert topics["imu"] == {"topic": "/imu", "frame": "imu_in_pelvis"}
     assert topics["joint_states"] == {"topic": "/joint_states", "joints": joints}
     assert again.joint_names == tuple(joints)
-    listed = "topics without an entry are listed in the file: /joint_command (sensor_msgs/msg/JointState): joints "
+    listed = "unused topics, listed in the file: /joint_command (sensor_msgs/msg/JointState): joints "
     assert any(text.startswith(listed) and "/a_chest/imu" in text for text in said.assumed)
 
 
@@ -251,7 +251,7 @@ def test_joints_that_messages_spell_otherwise_are_named_and_those_that_they_lack
 def test_states_of_a_few_joints_of_something_else_are_not_the_robots(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "x.mcap", legged(["other_left_knee", "other_right_knee"], []))
     said = init(G1, path, tmp_path / "x.yaml")
-    assert any(text.startswith("joint_states: to be filled in, a topic below: {topic:") for text in said.missing)
+    assert any(text.startswith("joint_states: fill in a topic below: {topic:") for text in said.missing)
     text = (tmp_path / "x.yaml").read_text()
     assert "    #   /joint_states (sensor_msgs/msg/JointState): joints other_left_knee" in text
     assert "    # joints of the robot: left_hip_pitch_joint, " in text
@@ -317,7 +317,7 @@ def test_a_bag_without_anything_is_answered_by_what_is_missing(tmp_path: Path) -
     assert topics is not None
     assert topics.by_role.keys() == {"joint_states"}
     assert load_config(tmp_path / "x.yaml").preprocessing.detect_contacts
-    assert any(text.startswith("joint_states: to be filled in") for text in said.missing)
+    assert any(text.startswith("joint_states: fill in ") for text in said.missing)
     assert "    #   /chatter (std_msgs/msg/String)\n" in path.with_suffix(".yaml").read_text()
 
 

@@ -116,7 +116,7 @@ def test_one_number_of_each_foot_is_no_flag_but_a_comment(tmp_path: Path) -> Non
     columns = by_name(log) | {f"force_{foot}": 10.0 * log.time for foot in log.contact_names}
     found, said, text = initiated(save_csv(tmp_path / "x.csv", columns))
     assert "    # contact_active: {column: 'force_{contact}', above: FILL_IN}" in text
-    assert any(line.startswith("contact_active: not sure") for line in said.missing)
+    assert any(line.startswith("contact_active: uncertain") for line in said.missing)
     assert_recorded(found, log)
 
 
@@ -297,7 +297,7 @@ def test_what_no_name_says_is_listed_and_filled_in_within_a_minute(
     log, (*names, message) = recorded(), UNKNOWN[what]
     path = save_csv(tmp_path / "x.csv", by_name(log, tuple(names)) | {"mode": [1] * 300, "note": ["a", "b"] * 150})
     said = init(URDF, path, tmp_path / "x.yaml")
-    assert said.lines[-1][1].endswith("next: fill in FILL_IN there")
+    assert said.lines[-1][1].endswith("next: replace FILL_IN there")
     text = (tmp_path / "x.yaml").read_text()
     comments = [line for line in text.splitlines() if line.lstrip().startswith("#   ")]
     assert all(len(line) <= 80 for line in comments)
@@ -317,7 +317,7 @@ def test_a_quaternion_without_the_order_of_its_components_is_left_to_a_person(tm
     _, said, text = initiated(tmp_path / "x.npz")
     assert "    # base_quat_wxyz: base_quat\n" in text
     assert "    # base_quat_xyzw: base_quat\n" in text
-    assert any(line.startswith("base_quat_wxyz, base_quat_xyzw: not sure") for line in said.missing)
+    assert any(line.startswith("base_quat_wxyz, base_quat_xyzw: uncertain") for line in said.missing)
 
 
 # ------------------------------------------------------------------------------------- stamps, columns without names

@@ -45,7 +45,7 @@ def in_order(read: Log) -> np.ndarray:
 def test_a_folder_without_stamps_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     save_csv(tmp_path / "empty" / "note.csv", {"width": np.ones(3)})
-    with pytest.raises(LogError, match="empty: file: a folder, 1 log without stamps and fields"):
+    with pytest.raises(LogError, match="empty: file: a folder with 1 log without stamps or known fields"):
         init(URDF, tmp_path / "empty", tmp_path / "robot.yaml")
 
 
@@ -53,7 +53,7 @@ def test_arrays_in_files_of_their_own_are_asked_for_as_one_file(tmp_path: Path) 
     (tmp_path / "walk").mkdir()
     for name in ("t", "q"):
         np.save(tmp_path / "walk" / f"{name}.npy", np.arange(9.0))
-    with pytest.raises(LogError, match=r"2 arrays in files of their own, q.npy, t.npy; accepted: .*numpy.savez\('walk"):
+    with pytest.raises(LogError, match=r"2 arrays in separate files: q.npy, t.npy; accepted: .*numpy.savez\('walk"):
         init(URDF, tmp_path / "walk", tmp_path / "robot.yaml")
     with pytest.raises(LogError, match=r"extension '.npy'; accepted: .*numpy.savez\('q.npz', x=x\)"):
         init(URDF, tmp_path / "walk" / "q.npy", tmp_path / "robot.yaml")

@@ -86,16 +86,16 @@ def test_several_files_are_checked_converted_and_compressed(demo: Path) -> None:
 def test_what_several_files_are_not_for_is_refused(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     large = f"logs.train={json.dumps([JOINED])}", "preprocessing.memory_gb=1e-4"
     assert "file: several files with " in refusal(capsys, "identify", "quadruped.yaml", *large)
-    assert "belongs to what is read" in refusal(capsys, "convert", NAME, "plates.npz", "--overwrite")
+    assert "this is an input, or in an input folder" in refusal(capsys, "convert", NAME, "plates.npz", "--overwrite")
 
 
 def test_no_sample_of_the_first_file_is_used_twice(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = "motion.npz + torques.npz + plates.npz@-3"
     error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:2]', other + '[1:]'])}")
-    assert "share samples; accepted: every sample once" in error
+    assert "share samples; accepted: each sample once" in error
     train, test = (
         f"logs.{name}={json.dumps([log])}" for name, log in (("train", NAME + "[:2]"), ("test", other + "[1:]"))
     )
     fast = f"estimator={json.dumps(FAST_ESTIMATOR)}"
     assert main(["identify", "quadruped.yaml", train, test, fast, "output=runs/x"]) == 0
-    assert f"{other}[1:] is fitted on as well" in capsys.readouterr().err
+    assert f"{other}[1:] is also used for the fit" in capsys.readouterr().err

@@ -110,7 +110,7 @@ def test_a_recorded_robot_that_stands_on_all_feet_is_refused_with_the_reason(
     }
     (tmp_path / "go2.yaml").write_text(yaml.safe_dump(experiment))
     message = refusal(["identify", str(tmp_path / "go2.yaml")], tmp_path, capsys)
-    assert "sensors.scales: of all measured forces, which no mass determines here: scale of *_hip_joint" in message
+    assert "sensors.scales: the data do not determine scales of all measured forces: scale of *_hip_joint" in message
     assert "accepted: a sensor without a scale, or logs in which each contact lifts" in message
 
 
@@ -154,8 +154,8 @@ def test_scales_of_all_motors_of_a_bolted_robot_are_refused_without_a_word_of_co
     }
     (tmp_path / "arms.yaml").write_text(yaml.safe_dump(experiment))
     message = refusal(["identify", str(tmp_path / "arms.yaml")], tmp_path, capsys)
-    assert "sensors.scales: of all measured forces, which no mass determines here" in message
-    assert "accepted: a sensor without a scale, or estimator.masses of bodies whose weight acts on it" in message
+    assert "sensors.scales: the data do not determine scales of all measured forces" in message
+    assert "accepted: a sensor without a scale, or known estimator.masses that load it" in message
 
 
 def test_exact_masses_hold_whatever_the_data_say_and_uncertain_ones_are_weighed() -> None:

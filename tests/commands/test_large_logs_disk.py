@@ -153,7 +153,7 @@ def test_a_log_that_no_memory_holds_is_not_checked_with_or_without_an_experiment
         said = main(["check", str(checked)]), capsys.readouterr()
         assert said[0] == 2
         (line,) = said[1].err.splitlines()
-        assert "file: arrays of 2.1 GB, which are not in memory at once; accepted: parts of the log, or" in line
+        assert "file: arrays of 2.1 GB do not fit in memory; accepted: parts of the log, or" in line
 
 
 @pytest.fixture

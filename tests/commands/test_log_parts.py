@@ -96,7 +96,7 @@ def test_parts_that_turn_out_to_overlap_are_warned_of_or_refused(demo: Path, tmp
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         analyzed('["sway_train.npz[:3]"]', '["sway_train.npz[-4:]"]')
-    assert any("sway_train.npz[-4:] is fitted on as well" in str(one.message) for one in caught)
+    assert any("sway_train.npz[-4:] is also used for the fit" in str(one.message) for one in caught)
     with pytest.raises(ConfigError, match="logs.train: .* share samples"):
         analyzed('["sway_train.npz[:3]", "sway_train.npz[-4:]"]', "[]")
 

@@ -57,20 +57,23 @@ def _run_kept_inside(run: Path) -> None:
 
 
 FOREIGN: dict[str, tuple[Add, str]] = {
-    "notes": (_text("notes.txt"), "notes.txt, which torchid did not write"),
-    "notes in an evaluation": (_text("evaluation/log/notes.txt"), "evaluation/log/notes.txt, which"),
-    "a hidden file": (_text(".git/config"), ".git/, which"),
-    "a hidden folder of a name like ours": (_text(".x-01234567.torchid/notes.txt"), ".x-01234567.torchid/, which"),
-    "an empty folder": (lambda run: (run / "ideas").mkdir(), "ideas/, which"),
-    "a pipe": (lambda run: os.mkfifo(run / "pipe"), "pipe, which"),
-    "control characters": (_text("\x1b[2J\n.txt"), r"\x1b[2J\n.txt, which"),
-    "edited figures": (_text("metrics.json"), "metrics.json, changed since torchid wrote it"),
-    "a link in place of a file": (_link("metrics.json"), "metrics.json, which"),
-    "a link in place of a folder": (_link("hparams"), "hparams, which"),
-    "a link in place of the evaluations": (_link("evaluation"), "evaluation, which"),
-    "a link in place of the manifest": (_link(MANIFEST), "no manifest.json that says"),
-    "an evaluation that was copied": (_evaluation_copied, "evaluation/kept/, which"),
-    "another run": (_run_kept_inside, "kept/, which"),
+    "notes": (_text("notes.txt"), "notes.txt (not written by torchid)"),
+    "notes in an evaluation": (_text("evaluation/log/notes.txt"), "evaluation/log/notes.txt (not written by torchid)"),
+    "a hidden file": (_text(".git/config"), ".git/ (not written by torchid)"),
+    "a hidden folder of a name like ours": (
+        _text(".x-01234567.torchid/notes.txt"),
+        ".x-01234567.torchid/ (not written",
+    ),
+    "an empty folder": (lambda run: (run / "ideas").mkdir(), "ideas/ (not written by torchid)"),
+    "a pipe": (lambda run: os.mkfifo(run / "pipe"), "pipe (not written by torchid)"),
+    "control characters": (_text("\x1b[2J\n.txt"), r"\x1b[2J\n.txt (not written by torchid)"),
+    "edited figures": (_text("metrics.json"), "metrics.json (changed since torchid wrote it)"),
+    "a link in place of a file": (_link("metrics.json"), "metrics.json (not written by torchid)"),
+    "a link in place of a folder": (_link("hparams"), "hparams (not written by torchid)"),
+    "a link in place of the evaluations": (_link("evaluation"), "evaluation (not written by torchid)"),
+    "a link in place of the manifest": (_link(MANIFEST), "no manifest.json of a run"),
+    "an evaluation that was copied": (_evaluation_copied, "evaluation/kept/ (not written by torchid)"),
+    "another run": (_run_kept_inside, "kept/ (not written by torchid)"),
 }
 
 
@@ -121,9 +124,7 @@ OTHERS: dict[str, dict[str, str]] = {
 def test_a_folder_without_a_manifest_of_torchid_is_no_run(tmp_path: Path, files: dict[str, str]) -> None:
     write(tmp_path / "run", files)
     before = everything(tmp_path)
-    with pytest.raises(
-        ConfigError, match="no manifest.json that says that torchid wrote a run; accepted: a new folder"
-    ):
+    with pytest.raises(ConfigError, match="but no manifest.json of a run; accepted: a new folder"):
         check_free(tmp_path / "run", True)
     assert everything(tmp_path) == before
 
@@ -145,7 +146,7 @@ def test_a_folder_of_one_kind_is_not_replaced_by_another(tmp_path: Path) -> None
     with new_folder(tmp_path / "x", kind=SIMULATION) as folder:
         write(folder, {"logs/a.npz": "x"})
     for kind in (RUN, TRAINING, EVALUATION):
-        with pytest.raises(ConfigError, match="holds a simulation; accepted: a new folder"):
+        with pytest.raises(ConfigError, match="contains a simulation; accepted: a new folder"):
             check_free(tmp_path / "x", True, kind)
 
 
@@ -154,7 +155,7 @@ def test_inputs_are_no_part_of_what_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(output)
     (tmp_path / "other.json").symlink_to(output / "metrics.json")
     for path in (output / "metrics.json", tmp_path / "link" / "metrics.json", tmp_path / "other.json"):
-        with pytest.raises(ConfigError, match="which is an input; accepted: another output"):
+        with pytest.raises(ConfigError, match="contains the input .*; accepted: another output"):
             check_free(output, True, RUN, [path])
     check_free(output, True, RUN, ["experiment", tmp_path / "elsewhere", tmp_path, tmp_path / "runs"])
     refuse_inputs(tmp_path / "ru", [output / "metrics.json"])
@@ -164,7 +165,7 @@ def test_inputs_are_no_part_of_what_is_replaced(tmp_path: Path) -> None:
 def test_a_folder_that_may_not_be_changed_is_refused_before_any_work(tmp_path: Path) -> None:
     output = a_run(tmp_path / "run")
     (output / "hparams").chmod(0o555)
-    with pytest.raises(ConfigError, match="hparams, where nothing can be removed"):
+    with pytest.raises(ConfigError, match="hparams .no write permission"):
         check_free(output, True)
     (output / "hparams").chmod(0o755)
 
@@ -213,9 +214,9 @@ def test_a_run_lists_every_file_of_its_own(copy: Path, place: Path, server: Comm
 def test_an_evaluation_somebody_wrote_in_is_not_replaced(copy: Path, place: Path, server: Commands) -> None:
     arguments = ["evaluate", str(copy), "--log", str(place / "demo" / "sway_test.npz")]
     (copy / "evaluation" / "sway_test" / "metrics.json").write_text("{}")
-    assert "metrics.json, changed since" in refused(server, arguments, copy)
+    assert "metrics.json (changed since" in refused(server, arguments, copy)
     write(copy, {"evaluation/sway_test/notes.txt": "mine"})
-    assert "holds notes.txt, which torchid did not write" in refused(server, arguments, copy)
+    assert "contains notes.txt (not written by torchid)" in refused(server, arguments, copy)
     (copy / "evaluation").rename(copy.parent / "elsewhere")
     (copy / "evaluation").symlink_to(copy.parent / "elsewhere")
     assert "evaluation: output: a link; accepted: a folder" in refused(server, arguments, copy.parent)
@@ -230,7 +231,7 @@ def test_the_end_of_a_training_takes_and_removes_what_is_its_own(tmp_path: Path)
     write(training.folder, files | {"notes.txt": "mine", "more/checkpoint.pt": "mine"})
     training.copy_curves(tmp_path)
     assert [path.name for path in tmp_path.glob("events*")] == ["events.out.tfevents.1.host.7.0"]
-    with pytest.warns(TorchidWarning, match="run.training: stays: it holds what torchid did not write"):
+    with pytest.warns(TorchidWarning, match="run.training: not removed, as it has files that torchid did not write"):
         training.remove_checkpoint()
     assert set(everything(training.folder)) == {"notes.txt", "more", "more/checkpoint.pt"}
 
@@ -242,7 +243,7 @@ def test_a_training_does_not_begin_where_somebody_keeps_notes(place: Path, tmp_p
     with new_folder(tmp_path / "run.training", kind=TRAINING) as folder:
         write(folder, {"config.yaml": "old"})
     write(tmp_path / "run.training", {"notes.txt": "mine"})
-    assert "holds notes.txt, which torchid did not write" in refused(server, line, tmp_path)
+    assert "contains notes.txt (not written by torchid)" in refused(server, line, tmp_path)
     (tmp_path / "run.training").rename(tmp_path / "elsewhere")
     (tmp_path / "run.training").symlink_to(tmp_path / "elsewhere")
     for more in ("overwrite=true", "--resume"):
@@ -271,7 +272,7 @@ def test_files_are_replaced_only_on_request_and_links_and_inputs_never(
     assert "--json: a link" in refusal([*given, "--overwrite"], tmp_path, capsys)
     (tmp_path / "same.npz").hardlink_to(log)
     for target in (log, tmp_path / "." / "log.npz"):
-        assert "what is read" in refusal(["convert", str(log), str(target), "--overwrite"], tmp_path, capsys)
+        assert "this is an input" in refusal(["convert", str(log), str(target), "--overwrite"], tmp_path, capsys)
 
 
 def test_experiments_never_remove_what_they_read(copy: Path, place: Path, tmp_path: Path, server: Commands) -> None:
@@ -281,14 +282,14 @@ def test_experiments_never_remove_what_they_read(copy: Path, place: Path, tmp_pa
     line = refused(
         server, ["identify", str(demo / "quadruped.yaml"), *more, f"logs.test=[{copy / 'mine.npz'}]"], tmp_path
     )
-    assert "mine.npz, which is an input" in line
+    assert "contains the input mine.npz" in line
     (copy / "mine.npz").unlink()
     line = refused(server, ["identify", str(copy / "config.yaml"), *more], tmp_path)
-    assert "config.yaml, which is an input" in line
+    assert "contains the input config.yaml" in line
     line = refused(
         server, ["identify", str(demo / "quadruped.yaml"), *more, f"robot.urdf={copy}/identified.urdf"], tmp_path
     )
-    assert "identified.urdf, which is an input" in line
+    assert "contains the input identified.urdf" in line
     shutil.copytree(demo, tmp_path / "project" / "logs")
     for command in ("identify", "analyze"):
         output = tmp_path / ("project.analysis" if command == "analyze" else "project")
@@ -296,4 +297,4 @@ def test_experiments_never_remove_what_they_read(copy: Path, place: Path, tmp_pa
             (tmp_path / "project").rename(output)
         more = [f"output={tmp_path / 'project'}", "overwrite=true"]
         line = refused(server, [command, str(output / "logs" / "quadruped.yaml"), *more], tmp_path)
-        assert "logs/quadruped.yaml, which is an input" in line
+        assert "contains the input logs/quadruped.yaml" in line

@@ -72,7 +72,11 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None], samples: int
 @pytest.mark.parametrize(
     ("change", "options", "told"),
     [
-        (silent_torques, ["sensors.set=joints", RIDGE], ("all measured forces are 0", "NaN where none was measured")),
+        (
+            silent_torques,
+            ["sensors.set=joints", RIDGE],
+            ("all measured forces are 0", "NaN: not measured"),
+        ),
         (reversed_torques, ["sensors.set=joints", RIDGE], ("total mass is -21.", "opposite sign", "all reversed")),
         (
             exchanged_legs,
@@ -123,9 +127,9 @@ def test_a_fit_that_predicts_worse_than_the_urdf_says_so_first(
     assert main(["identify", str(DEMO / "quadruped.yaml"), *options]) == 0
     printed = capsys.readouterr()
     headline, *_ = printed.out.splitlines()
-    assert headline.startswith("WORSE THAN URDF: the identified parameters predict worse than the URDF, on ")
+    assert headline.startswith("WORSE THAN URDF (URDF -> identified) on ")
     assert "NumericalWarning" in printed.err
-    assert "predict worse than the URDF, on blocks left out of the fit: joint torque" in printed.err
+    assert "WORSE THAN URDF (URDF -> identified) on blocks left out of the fit: joint torque" in printed.err
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["verdict"] in printed.err
     worse = {(x["logs"], x["group"]): x for x in metrics["worse_than_nominal"]}
@@ -211,4 +215,4 @@ def test_forces_of_bodies_that_cannot_exist_are_named(
     }
     (tmp_path / "stage.yaml").write_text(json.dumps(settings))
     assert main(["identify", str(tmp_path / "stage.yaml")]) == 0
-    assert ("no bodies that can exist explain these forces" in capsys.readouterr().out) == (sign < 0.0)
+    assert ("No physically consistent bodies explain these forces" in capsys.readouterr().out) == (sign < 0.0)

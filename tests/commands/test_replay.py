@@ -54,7 +54,7 @@ def test_the_identified_robot_stays_nearer_to_a_new_log_than_the_urdf(
         assert least[-1] < largest[-1] < 0.5 * nominal[1, -1]
         assert any(f"{least[-1]:.3g} to {largest[-1]:.3g}" in line for line in lines)
     assert document["samples"]["count"] == PARAMETER_SAMPLES
-    assert lines[0].startswith("Drift after 0.2 s of the torques of sway_test[:3] alone")
+    assert lines[0].startswith("Drift after 0.2 s, driven by the torques of sway_test[:3], ")
     assert len(lines) <= 20
     assert max(map(len, lines)) <= 100
     kind = read_manifest(output)
@@ -77,14 +77,14 @@ def test_pd_targets_keep_both_nearer_to_the_log(run: Path, tmp_path: Path, capsy
         assert main(["replay", str(run), "--log", f"{UNSEEN}[:3]", *shown, *gains]) == 0
         document = json.loads((output / "replay.json").read_text())
         ends.append([document["quartiles"]["joints [rad]"][who][1][-1] for who in ("nominal", "identified")])
-    assert "Drift after 0.2 s of the PD targets of sway_test[:3] alone" in capsys.readouterr().out
+    assert "Drift after 0.2 s, driven by the PD targets of sway_test[:3], " in capsys.readouterr().out
     assert document["kp"]["rear_left_knee"] == 40.0
     assert document["kp"]["rear_left_hip"] == 20.0
     assert set(document["kd"].values()) == {0.5}
     assert ends[1][0] < 0.8 * ends[0][0]
     assert ends[1][1] < ends[1][0]
     for wrong, message in (
-        ("stiff", "--kp: 'stiff'; accepted: a number"),
+        ("stiff", "--kp: 'stiff'; accepted: numbers of at least 0"),
         ("nee=3", "--kp: unknown name 'nee'"),
         ("-1", "--kp: -1"),
     ):
@@ -108,7 +108,11 @@ def test_windows_that_no_log_has_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("units", "shares"), [(("rad", "m"), "joints [rad] 1 %, joints [m] 10 %"), (("rad", "rad"), "joints 4.6 %")]
+    ("units", "shares"),
+    [
+        (("rad", "m"), "joints [rad] 100 times smaller, joints [m] 10 times smaller"),
+        (("rad", "rad"), "joints 22 times smaller"),
+    ],
 )
 def test_drifts_of_hinges_and_slides_are_told_apart(units: tuple[str, ...], shares: str) -> None:
     time = np.array([0.0, 0.5])
@@ -123,7 +127,7 @@ def test_drifts_of_hinges_and_slides_are_told_apart(units: tuple[str, ...], shar
         of="URDF",
         gains=np.zeros((2, 2)),
     )
-    assert f"as a share of the URDF's: {shares} (1 window)" in replay_lines(found, 200)[0]
+    assert f", compared with the URDF: {shares} (1 window)." in replay_lines(found, 200)[0]
     driven = replace(found, gains=np.ones((2, 2)))
     for one, by in ((found, "the torques of log"), (driven, "the PD targets of log")):
         figure = drift_figure(one.driven, time, one.quartiles(), {}, one.by_joint(), units, "URDF")
@@ -135,8 +139,8 @@ def test_what_a_replay_lacks_is_named(run: Path, tmp_path: Path, capsys: pytest.
         log = dict(arrays)
     np.savez(tmp_path / "untorqued.npz", **{name: x for name, x in log.items() if name != "joint_torque"})
     no_torque = ["replay", str(run), "--log", str(tmp_path / "untorqued.npz")]
-    assert "the torques of all joints" in refusal(no_torque, tmp_path, capsys)
-    assert "a folder that torchid identify wrote" in refusal(
+    assert "a log with all joint torques" in refusal(no_torque, tmp_path, capsys)
+    assert "a folder written by torchid identify" in refusal(
         ["replay", str(tmp_path), "--log", UNSEEN], tmp_path, capsys
     )
 
@@ -171,7 +175,8 @@ def test_a_run_with_welds_is_replayed_with_the_joint_held(tmp_path: Path) -> Non
 
 def test_a_flat_contact_without_spheres_is_refused_with_what_a_replay_can_stand_on() -> None:
     urdf = DEMO / "quadruped.urdf"
-    with pytest.raises(ConfigError, match=r"contacts: trunk: flat, .*quadruped\.urdf.* point contacts"):
+    found = r"trunk is a flat contact, but quadruped\.urdf has no collision spheres there; accepted: point contacts"
+    with pytest.raises(ConfigError, match=f"contacts: {found}"):
         _feet([Contact("trunk", "flat")], urdf)
 
 

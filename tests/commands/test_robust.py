@@ -33,7 +33,7 @@ def test_a_run_says_how_its_robust_fit_went_and_whether_it_settled(
     printed = capsys.readouterr()
     assert "of the weight kept, 1 passes" in printed.out
     assert "NumericalWarning: " in printed.err
-    assert "estimator.robust: not converged after 1 passes; accepted: more passes" in printed.err
+    assert "estimator.robust: not converged after 1 passes. Raise its passes." in printed.err
     robust = json.loads((output / "metrics.json").read_text())["robust"]
     assert (robust["loss"], robust["tuning"], robust["passes"], robust["converged"]) == ("tukey", 4.685, 1, False)
     assert 0.9 < robust["mean_weight"] < 1.0

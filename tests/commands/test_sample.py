@@ -36,7 +36,7 @@ def test_npz_has_names_and_bodies_that_exist(run: Path, tmp_path: Path, capsys: 
     out = tmp_path / "s.npz"
     assert main(["sample", str(run), "--count", "500", "--output", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "500 robots that can exist" in printed
+    assert "500 physically consistent robots" in printed
     assert max(map(len, printed.splitlines())) <= 100
     with np.load(out) as arrays:
         samples, names = arrays["samples"], arrays["names"].tolist()
@@ -51,7 +51,7 @@ def test_npz_has_names_and_bodies_that_exist(run: Path, tmp_path: Path, capsys: 
 def test_robots_are_the_samples(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="MuJoCo is not installed")
     drawn = sample(run, 3, "npz", tmp_path / "s.npz", seed=7)
-    with pytest.warns(torchid.TorchidWarning, match="has no armature"):
+    with pytest.warns(torchid.TorchidWarning, match="the armature of"):
         sample(run, 3, "urdf", tmp_path / "urdf", seed=7)
     sample(run, 3, "mjcf", tmp_path / "mjcf", seed=7)
     for number in range(3):
@@ -85,9 +85,9 @@ def test_ranges_and_correlations_are_those_of_the_samples(run: Path, tmp_path: P
         (["--prior-error", "-1"], "--prior-error: -1; accepted: a number above 0, at most 100, or auto"),
         (["--prior-error", "wide"], "--prior-error: 'wide'; accepted: a number above 0, at most 100, or auto"),
         (["--seed", "-1"], "--seed: -1; accepted"),
-        (["--output", "x.txt"], "'x.txt', whose extension says no format; accepted: FILE.npz"),
+        (["--output", "x.txt"], "'x.txt' has no known extension; accepted: FILE.npz"),
         (["--output", "x.txt", "--format", "npz"], "'x.txt'; accepted: FILE.npz"),
-        (["--output", "no/such/folder.npz"], "no folder no/such"),
+        (["--output", "no/such/folder.npz"], "the folder no/such does not exist"),
     ],
 )
 def test_mistakes_end_in_one_line(
@@ -105,7 +105,7 @@ def test_runs_without_a_posterior_are_refused_with_advice(run: Path, tmp_path: P
     (old / POSTERIOR).unlink()
     with pytest.raises(torchid.TorchidError, match=r"no posterior\.npz in it; accepted: a run folder of this version"):
         sample(old)
-    with pytest.raises(ConfigError, match=r"no config\.yaml in it"):
+    with pytest.raises(ConfigError, match=r"config\.yaml is missing"):
         sample(tmp_path)
     with pytest.raises(torchid.TorchidError, match="none: RUN: no such file or folder; accepted: a run folder of this"):
         torchid.PosteriorSampler(tmp_path / "none")

@@ -93,8 +93,8 @@ def test_simulators_files_have_it_or_say_that_they_lack_it(folder: Path, capsys:
         capsys.readouterr()
         assert main(["export", run, "--format", form, "--output", f"{out}.{form}"]) == 0
         said = " ".join(capsys.readouterr().err.split())
-        assert ("has no Stribeck friction, which" in said) == lacks
-        assert ("friction at rest is Coulomb's alone" in said) == lacks
+        assert ("Stribeck friction of " in said) == lacks
+        assert ("N m (N) at rest. Use --format isaaclab or json." in said) == lacks
     joints = json.loads(Path(f"{out}.json").read_text())["joints"]
     assert [x["stribeck"] for x in joints.values()] == pytest.approx(AT_REST, rel=0.1)
     assert {x["stribeck_velocity"] for x in joints.values()} == {_found(folder / "run")["stribeck"]}
@@ -114,7 +114,7 @@ def test_simulators_files_have_it_or_say_that_they_lack_it(folder: Path, capsys:
         (["actuators.stribeck=0"], "actuators.stribeck: found 0; accepted:"),
         (["actuators.stribeck=fast"], "actuators.stribeck: found 'fast'; accepted: auto, null, or a number"),
         (["actuators.stribeck=true"], "actuators.stribeck: found True; accepted: auto, null, or a number"),
-        (["estimator.friction=false"], "actuators.stribeck: set, but estimator.friction: false leaves"),
+        (["estimator.friction=false"], "actuators.stribeck: needs fitted Coulomb friction, but estimator"),
     ],
 )
 def test_mistakes_are_answered_in_a_line(

@@ -52,8 +52,8 @@ def test_the_foot_that_reads_too_much_is_found_and_no_other(terms: ExtraTerms) -
     found = leave_sensors_out([walk(1.3)], fitter_of(terms), terms, sets)
     assert [name for name in sets if found[name].adopted] == [FEET[1].frame, f"{ALL_OF}contact"]
     first, kind = contradicting_messages(found)
-    assert first.startswith(f"without {FEET[1].frame} errors of the others are ")
-    assert kind.startswith(f"without {ALL_OF}contact ")
+    assert first.startswith(f"Without {FEET[1].frame} the error of the other sensors is ")
+    assert kind.startswith(f"Without {ALL_OF}contact ")
     clean = leave_sensors_out([walk(1.0)], fitter_of(terms), terms, sets)
     assert not any(one.adopted for one in clean.values())
     assert not contradicting_messages(clean)

@@ -45,7 +45,7 @@ def test_the_logs_of_an_experiment_file_are_checked_one_by_one(
     train, test = printed.split("sway_test.npz")
     assert "sway_train.npz: 400 samples, 3.99 s" in train
     assert "verdict       usable\n" in train
-    assert "joint_torque, spike" in test
+    assert "joint_torque (spike)" in test
     assert "verdict       usable without 1 of 400 samples\n" in test
     assert max(map(len, printed.splitlines())) <= 100
 
@@ -56,10 +56,10 @@ ONE_FOOT = "{set: null, contact_wrenches: {front_left_foot: [fx, fy, fz]}}"
 @pytest.mark.parametrize(
     ("sensors", "settings", "said"),
     [
-        ("joints", [], "joint_torque '{joint}', does not fit"),
+        ("joints", [], "joint_torque '{joint}' (does not fit)"),
         ("contacts", [], ""),
-        ("contacts", ["preprocessing.cutoff_hz=60"], "preprocessing.cutoff_hz, does not fit"),
-        (ONE_FOOT, [], "sensors, does not fit"),  # of which the base's six rows cannot be told
+        ("contacts", ["preprocessing.cutoff_hz=60"], "preprocessing.cutoff_hz (does not fit)"),
+        (ONE_FOOT, [], "sensors (does not fit)"),  # of which the base's six rows cannot be told
         (ONE_FOOT, ["sensors.on_base_lost=warn"], ""),
     ],
 )
@@ -85,7 +85,7 @@ def test_frames_that_are_sent_again_are_one_row_of_the_table(folder: Path, capsy
     assert main(["check", "--verbose", str(folder / "sway_train.npz")]) == 0
     printed = capsys.readouterr().out
     assert printed.count("rejected") == 1
-    assert "likewise" in printed
+    assert "; also " in " ".join(printed.split())
     assert "usable without 6 of 400 samples" in printed
 
 
@@ -112,7 +112,7 @@ def test_a_log_that_is_not_usable_ends_with_status_one(folder: Path, capsys: pyt
     assert main(["check", str(folder / "quadruped.yaml")]) == 1
     printed = capsys.readouterr().out
     assert printed.startswith("1 of 2 logs is usable")
-    assert "rejected      joint_position, unit in sway_train.npz: " in printed
+    assert "rejected      joint_position (unit) in sway_train.npz: " in printed
 
 
 @pytest.mark.parametrize("samples", [1, 4])
@@ -217,7 +217,7 @@ def test_a_recorded_arm_is_usable_and_its_stamps_are_seen_to_jitter(
     for name in ("run1", "run2"):
         given = [str(ARM / f"{name}.npz"), "--urdf", urdf, "--fixed-base", "--json", str(document), "--overwrite"]
         assert main(["check", *given]) == 0
-        assert ": usable; free of usual mistakes\n" in capsys.readouterr().out
+        assert ": usable; no mistake found\n" in capsys.readouterr().out
         (log,) = json.loads(document.read_text())["logs"]
         severities = {finding["name"]: finding["severity"] for finding in log["findings"]}
         assert severities == {"jitter": "note", "inertials": "note"}, "its last link has 0.3 kg and 0.5 m of gyration"
@@ -251,6 +251,6 @@ def test_the_shipped_demo_is_usable_without_reserve(capsys: pytest.CaptureFixtur
         shutil.copy(DEMO / name, tmp_path)
     assert main(["check", str(tmp_path / "quadruped.yaml")]) == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("2 of 2 logs are free of usual mistakes\n")
+    assert printed.startswith("No mistake found in 2 logs.\n")
     assert "rejected" not in printed
     assert "suspicious" not in printed

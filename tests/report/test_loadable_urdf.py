@@ -127,7 +127,7 @@ def test_collision_meshes_and_relative_names_become_full_paths_and_packages_of_v
 def test_collisions_that_mujoco_does_not_find_or_read_are_left_out_and_said(name: str, tmp_path: Path) -> None:
     mesh_in(tmp_path, "machine/meshes/a.dae")
     robot = pair(tmp_path, shape("visual", "package://machine/meshes/a.dae"), shape("collision", name))
-    with pytest.warns(TorchidWarning, match=f"are left out, .*: {name}; torchid export --format urdf keeps them"):
+    with pytest.warns(TorchidWarning, match=f"are left out: {name}. To keep them, use torchid export --format urdf"):
         path = written(robot, tmp_path)
     assert mesh_names(path) == ["package://machine/meshes/a.dae"], "RViz shows it, MuJoCo skips it"
     assert assert_loads(path, 3.0).ngeom == 0

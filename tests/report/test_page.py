@@ -101,9 +101,9 @@ def test_logs_that_have_gone_are_said_to_be_unchecked(run: Path, tmp_path: Path)
     [
         (DATA, None, r"report\.json: missing"),
         (DATA, "{", r"report\.json: not readable as JSON"),
-        (DATA, "{}", r"metrics\.json, report\.json: not what a page needs"),
-        ("parameters.json", "[]", r"parameters\.json, .*: not what a page needs"),
-        ("manifest.json", "{}", "RUN: no run of torchid"),
+        (DATA, "{}", r"metrics\.json, report\.json: not usable for the page"),
+        ("parameters.json", "[]", r"parameters\.json, .*: not usable for the page"),
+        ("manifest.json", "{}", "RUN: not a run of torchid"),
     ],
 )
 def test_a_damaged_run_is_refused_in_one_line(
@@ -125,9 +125,9 @@ def test_a_run_writes_its_page_with_figures_that_a_browser_shows(
     settings = [str(run.parent / "quadruped.yaml"), f"output={tmp_path / 'new'}", f"figures.format={form}"]
     assert main(["identify", "-q", *settings]) == 0
     written = (tmp_path / "new" / PAGE).read_text()
-    assert f"torchid report {tmp_path / 'new'} checks the logs" in written
+    assert f"To list the findings of the log checks here, run torchid report {tmp_path / 'new'}." in written
     assert ("data:image/svg+xml;base64," in written) is shown
-    assert ("those in PDF are files of their own" in written) is not shown
+    assert ("PDF figures are separate files" in written) is not shown
 
 
 MEGABYTE = 1_000_000

@@ -205,8 +205,8 @@ def test_impossible_bodies_and_driving_friction_are_warned_of_by_name(tmp_path: 
     with pytest.warns(TorchidWarning) as caught:
         identified_urdf(robot, phi)
     impossible, driving = (str(warning.message) for warning in caught)
-    assert f"parameters of {robot.body_names[1]};" in impossible
-    assert f"negative friction at {robot.joint_names[1]};" in driving
+    assert f"not physically consistent, simulators refuse or misread them: {robot.body_names[1]}." in impossible
+    assert f"refuse the negative friction of {robot.joint_names[1]}." in driving
 
 
 # ------------------------------------------------------------------------------------------------- a consistent fit

@@ -79,7 +79,7 @@ def test_joints_that_rest_are_named_where_forces_are_not_explained(consistent: I
     resting = replace(consistent, resting={"front_left_knee": 1.0, "rear_left_hip": 0.31})
     unexplained = replace(resting, misfit=replace(resting.misfit, lack_of_fit=9.0))
     said = " ".join(text(unexplained).split())
-    assert "actuators.stiction=true, as joints rest (front_left_knee 100 %, rear_left_hip 31 %)" in said
+    assert "as joints rest (front_left_knee 100 %, rear_left_hip 31 %). Set actuators.stiction=true." in said
     assert "stiction" not in text(resting)
 
 
@@ -89,14 +89,14 @@ def test_joints_that_never_move_are_named_where_their_torque_counts_as_unmeasure
     run = replace(consistent, experiment=replace(consistent.experiment, config=taken))
     assert "stiction" not in text(replace(run, resting={"rear_left_hip": 0.9}))
     said = " ".join(text(replace(run, resting={"front_left_knee": 1.0, "rear_left_hip": 0.9})).split())
-    assert "no friction of front_left_knee: at rest, or too near to it for the filter, throughout" in said
+    assert "No friction is identified of front_left_knee: they always rest, or almost," in said
 
 
 def test_errors_on_motion_that_was_fitted_are_not_those_of_unseen_motion(consistent: Identification) -> None:
     config = consistent.experiment.config
     fitted = replace(config, logs=replace(config.logs, test=config.logs.train))
     said = text(replace(consistent, experiment=replace(consistent.experiment, config=fitted)))
-    assert said.startswith("Much better than the URDF on motion that the fit has seen (sway_train.npz)")
+    assert said.startswith("Much better than the URDF on training motion (sway_train.npz)")
 
 
 def test_logs_in_which_nothing_moves_judge_neither_inertia_nor_friction(
@@ -105,19 +105,19 @@ def test_logs_in_which_nothing_moves_judge_neither_inertia_nor_friction(
     assert list(consistent.at_rest) == list(free.at_rest) == []
     for run, rests, where in (
         (consistent, "test", "the test logs (sway_test.npz)"),
-        (free, "train", "blocks of the training logs, each left out of the fit (5)"),
+        (free, "train", "5 held-out blocks of the training logs"),
     ):
         said = " ".join(text(replace(run, at_rest=[rests])).split())
-        assert said.startswith(f"At rest alone, as nothing moves in {where}: errors of ")
-        assert "; inertia and friction are not judged" in said
+        assert said.startswith(f"Nothing moves in {where}: inertia and friction are not judged. ")
+        assert "Compared with the URDF, the error is " in said
         assert "etter than the URDF" not in said
-    assert "At rest" not in text(replace(consistent, at_rest=["train"]))  # the test moves
+    assert "Nothing moves" not in text(replace(consistent, at_rest=["train"]))  # the test moves
 
 
 def test_without_test_logs_blocks_left_out_are_judged_and_the_text_says_so(free: Identification) -> None:
     first = text(free).split("rms error of")[0].replace("\n", " ")
-    assert "blocks of the training logs, each left out of the fit (5)" in first
-    assert first.startswith("Mixed, against the URDF on ")
+    assert "5 held-out blocks of the training logs" in first
+    assert first.startswith("Mixed, compared with the URDF on ")
     assert "joints and base axes, worse in " in first
     assert free.validation is not None
     assert f"{free.validation.identified.rms['joint_torque']:.4g}" in text(free)
@@ -130,7 +130,7 @@ def test_projected_forces_are_shown_where_no_joint_or_base_force_can_be(consiste
     pair = consistent.metrics["test"]
     fewer = pair._replace(nominal=without_others(pair.nominal), identified=without_others(pair.identified))
     said = text(replace(consistent, metrics=consistent.metrics | {"test": fewer}))
-    assert f"{pair.identified.rms['nullspace']:.4g}" in said.split("projected [N, N m]")[1].split("\n")[0]
+    assert f"{pair.identified.rms['nullspace']:.4g}" in said.split("projected force [N, N m]")[1].split("\n")[0]
     assert "base force" not in said
     assert "projected" not in text(consistent)
 
@@ -138,23 +138,24 @@ def test_projected_forces_are_shown_where_no_joint_or_base_force_can_be(consiste
 def test_bodies_that_cannot_exist_are_counted_with_what_to_do(consistent: Identification, free: Identification) -> None:
     bodies = {violation.body for violation in free.violations}
     assert len(bodies) > 2
-    assert f"{len(bodies)} of 13 cannot exist, and simulators refuse them; estimator.name=consistent" in text(free)
-    assert "all 13 can exist, and simulators take them" in text(consistent)
-    assert "cannot exist" not in text(consistent)
+    advice = "simulators refuse them. Use estimator.name=consistent"
+    assert f"{len(bodies)} of 13 not physically consistent; {advice}" in " ".join(text(free).split())
+    assert "all 13 physically consistent; load in MuJoCo" in text(consistent)
+    assert "not physically consistent" not in text(consistent)
 
 
 def test_a_file_that_simulators_refuse_is_not_said_to_be_taken(consistent: Identification) -> None:
     phi = consistent.phi.copy()
     phi[3, 1:10] = 0.0  # a point mass at the axis that moves it, which breaks no condition
     said = " ".join(text(replace(consistent, estimate=replace(consistent.estimate, phi=phi.flatten()))).split())
-    assert "all 13 can exist, but simulators refuse their file: " in said
-    assert "simulators take them" not in said
+    assert "all 13 physically consistent, but MuJoCo refuses the file: " in said
+    assert "load in MuJoCo" not in said
 
 
 def test_a_total_mass_that_contradicts_the_urdf_needs_attention(consistent: Identification) -> None:
-    assert "weigh the robot" not in text(consistent)
+    assert "Weigh the robot" not in text(consistent)
     light = replace(consistent, mass=replace(consistent.mass, value=0.4 * consistent.mass.nominal))
-    assert "attention     the total mass is 0.4 times the URDF's: weigh the robot" in text(light, 400)
+    assert "attention     The total mass is 0.4 times the URDF's. Weigh the robot" in text(light, 400)
     vague = replace(light, mass=replace(light.mass, standard_error=0.4 * consistent.mass.nominal))
     assert "times the URDF's" not in text(vague)
 
@@ -162,8 +163,8 @@ def test_a_total_mass_that_contradicts_the_urdf_needs_attention(consistent: Iden
 def test_bodies_that_a_weak_prior_lets_go_far_from_the_urdf_are_said_to_weigh_so(consistent: Identification) -> None:
     unknown, nominal = replace(consistent.mass, standard_error=np.inf), consistent.mass.nominal
     near, far = (text(replace(consistent, mass=replace(unknown, value=x * nominal)), 400) for x in (1.1, 5.0))
-    assert "attention     these data do not determine the total mass; weigh the robot: estimator.total_mass" in near
-    assert "and the fit lets it be 104.000 kg (20.800 kg by the URDF)" in far
+    assert "attention     These data do not determine the total mass. Weigh the robot: estimator.total_mass" in near
+    assert "(the fit: 104.000 kg, URDF: 20.800 kg)" in far
 
 
 @pytest.mark.parametrize(("variation", "of_weight", "told"), [(1.4, 0.5, True), (1.4, 0.01, False), (0.5, 0.5, False)])
@@ -174,7 +175,8 @@ def test_a_base_force_that_a_constant_would_predict_as_well_is_not_explained(
     relative = {**pair.identified.relative, "base_force": of_weight}
     found = replace(pair.identified, base_force_of_variation=variation, relative=relative)
     said = text(replace(consistent, metrics=consistent.metrics | {"test": pair._replace(identified=found)}), 400)
-    assert ("attention     base force: errors of 1.4 times what its measurements vary by; check frames" in said) is told
+    error = "The error of the base force is 1.4 times the variation of its measured value"
+    assert (f"attention     {error}. Check frames" in said) is told
     assert ("model does not explain these forces" in said.split("rms error")[0]) is told
 
 
@@ -185,15 +187,16 @@ def test_forces_that_the_file_itself_predicts_are_said_to_be_computed(
     pair = consistent.metrics["test"]
     near = replace(pair.nominal, relative=dict.fromkeys(pair.nominal.relative, share))
     metrics = consistent.metrics | {"test": pair._replace(nominal=near)}
-    assert ("were they computed from it" in text(replace(consistent, metrics=metrics), 200)) == told
+    assert ("Are they computed from it" in text(replace(consistent, metrics=metrics), 200)) == told
 
 
 def test_projected_forces_that_no_bodies_would_predict_as_well_are_not_explained(consistent: Identification) -> None:
     pair = consistent.metrics["test"]
     found = replace(pair.identified, relative={**pair.identified.relative, "nullspace": 1.31})
     said = text(replace(consistent, metrics=consistent.metrics | {"test": pair._replace(identified=found)}), 400)
-    assert "errors of 1.3 times what was measured; check signs, units and order of joints: torchid check" in said
-    assert "what was measured" not in text(consistent, 400)
+    error = "The error of the projected force is 1.3 times the measured value"
+    assert f"{error}. Check signs, units and order of joints: torchid check." in said
+    assert "the measured value" not in text(consistent, 400)
 
 
 @pytest.mark.parametrize(
@@ -234,8 +237,9 @@ def test_bodies_that_are_heavy_without_data_are_named_together_with_a_ridge_that
     phi[[PER_BODY, 2 * PER_BODY]] = [5.0, 3.0] * robot.nominal[[1, 2], 0]
     said = text(replace(consistent, estimate=replace(estimate, phi=phi, identifiable=known)), 400)
     names, ridge = robot.body_names, consistent.experiment.config.estimator.ridge
-    assert f"attention     {names[1]} 5 times, {names[2]} 3 times the URDF's mass, which the data do not" in said
-    assert f"an estimator.ridge above {ridge}" in said
+    named = f"{names[1]} 5 times, {names[2]} 3 times the URDF's"
+    assert f"attention     Masses that the data do not determine are large: {named}. Raise" in said
+    assert f"Raise estimator.ridge above {ridge}." in said
 
 
 @pytest.mark.parametrize(("errors", "told"), [(-5.0, True), (-3.0, False)])
@@ -247,7 +251,7 @@ def test_friction_that_drives_a_joint_beyond_its_errors_points_to_a_reversed_tor
     said = text(replace(consistent, estimate=replace(consistent.estimate, phi=phi)), 400)
     body = consistent.experiment.robot.bodies[2]
     assert body.joint is not None
-    assert (f"friction drives {body.joint.name}: its torque is reversed" in said) is told
+    assert (f"The Coulomb friction of {body.joint.name} is negative: the torque is reversed" in said) is told
 
 
 @pytest.mark.parametrize(("share", "unlike"), [(0.3, True), (0.6, False)])
@@ -261,7 +265,7 @@ def test_bodies_far_off_their_file_need_a_wider_prior_and_a_line_says_which(
     said = text(replace(consistent, posterior=wrong), 400)
     assert "torchid sample --prior-error auto" in said
     assert str(wrong.nominal_error) in said
-    assert ("does not explain these forces, or the file is another robot's" in said) is unlike
+    assert ("does not explain these forces, or the file is of another robot" in said) is unlike
     assert "--prior-error" not in text(consistent, 400)
 
 
@@ -273,7 +277,7 @@ def test_a_rod_in_the_file_is_named_where_bodies_are_far_off_it(consistent: Iden
     thin.reshape(-1, PER_BODY)[2, INERTIAL] = [1.0, 0.0, 0.0, 0.1, 0.02, 0.0, 0.0, 0.02, 0.0, 0.0]
     wrong = replace(fitted, posterior=replace(fitted.posterior, nominal=thin))
     said = text(replace(consistent, posterior=wrong), 400)
-    assert f"the file is another robot's, or it has rods or plates ({fitted.body_names[2]});" in said
+    assert f"the file is of another robot, or it has rods or plates ({fitted.body_names[2]})." in said
 
 
 def test_a_descent_that_ended_above_the_optimum_says_so(consistent: Identification) -> None:
@@ -282,23 +286,23 @@ def test_a_descent_that_ended_above_the_optimum_says_so(consistent: Identificati
     for excess, told in ((0.002, False), (0.29, True), (None, True)):
         descent = {"epochs": 9, "best_epoch": 9, "residual": None, "excess": excess}
         said = text(replace(consistent, estimate=SgdEstimate(**shared | descent)), 400)
-        assert ("attention     not converged" in said) is told
-        assert ("not converged: 29 % above the optimum" in said) is (excess == 0.29)
+        assert ("attention     Not converged" in said) is told
+        assert ("Not converged: 29 % above the optimum" in said) is (excess == 0.29)
 
 
 def test_intervals_that_count_noise_alone_say_so(consistent: Identification) -> None:
     assert consistent.estimate.block_error is not None
-    assert "count noise alone" not in text(consistent, 400)
+    assert "include noise only" not in text(consistent, 400)
     short = replace(consistent, samples=50, estimate=replace(consistent.estimate, block_error=None, oversampling=2.0))
     said = text(short, 400)
-    assert "attention     95 % intervals count noise alone, no error of the model, which 25 independent samples" in said
+    assert "attention     95 % intervals include noise only, no model errors: 25 independent samples are" in said
 
 
 def test_residuals_that_cannot_contradict_the_model_are_said_to_show_nothing(consistent: Identification) -> None:
     assert consistent.misfit.judged
     short = replace(consistent, misfit=replace(consistent.misfit, expected=None, lack_of_fit=None))
     said = text(short, 400)
-    assert "attention     whether the model explains these forces is not known" in said
+    assert "attention     It is unknown whether the model explains these forces" in said
     assert "sensors.noise" in said
 
 
@@ -314,13 +318,13 @@ def test_errors_of_a_sensor_in_a_limb_are_shown_and_need_attention_where_they_ex
         return text(replace(consistent, metrics={**consistent.metrics, "test": one}), 400)
 
     assert "force in limbs [N]" not in text(consistent)
-    assert "attention     force in limbs: errors of 1.3 times what was measured; check the sensor" in with_limb(1.26)
+    assert "attention     The error of the force in limbs is 1.3 times the measured value" in with_limb(1.26)
     assert re.search(r"force in limbs \[N\] +230 +30", said := with_limb(0.3))
-    assert "what was measured" not in said
+    assert "the measured value" not in said
 
 
 def test_what_needs_attention_is_named_with_what_to_do(free: Identification) -> None:
-    (line,) = [line for line in text(free, 400).splitlines() if line.startswith("attention     friction, ")]
+    (line,) = [line for line in text(free, 400).splitlines() if line.startswith("attention     Friction, ")]
     assert line.count("most in joint_torque") == 1
     misfit = free.misfit
     several = replace(misfit, expected=0.4 * misfit.residual, lack_of_fit=3.0, share=0.1)
@@ -330,8 +334,8 @@ def test_what_needs_attention_is_named_with_what_to_do(free: Identification) -> 
     worse = replace(free)
     worse.__dict__["worse"] = [WorseThanNominal("test logs", "joint_torque", 1.0, 2.0)]
     said = text(worse, 400)
-    assert said.startswith("WORSE THAN URDF: the identified parameters predict worse than the URDF, on test logs")
-    assert said.index("attention     do not use them") < said.index("attention     friction, ")
+    assert said.startswith("WORSE THAN URDF (URDF -> identified) on test logs: joint torque 1 -> 2 N m")
+    assert said.index("attention     Do not use these parameters") < said.index("attention     Friction, ")
 
 
 def test_the_bodies_that_changed_most_are_listed_in_the_robots_order(consistent: Identification) -> None:
@@ -359,8 +363,8 @@ def test_the_bodies_that_changed_most_are_listed_in_the_robots_order(consistent:
             )
             assert value == pytest.approx(phi[body, k], abs=0.5 * errors[body, k])
             assert error == pytest.approx(errors[body, k], rel=0.1)
-    assert f"and {13 - len(rows)} bodies whose mass changed less" in "\n".join(lines)
-    assert "+ known only in sums with other bodies" in lines
+    assert f"and {13 - len(rows)} bodies with a smaller change of mass: --verbose" in "\n".join(lines)
+    assert "+ identified only in sums with other bodies" in lines
 
 
 def test_friction_that_no_joint_shows_has_no_columns(consistent: Identification) -> None:
@@ -391,7 +395,14 @@ def test_all_tables_are_printed_when_asked_for_and_nothing_when_asked_to_be_quie
     assert printed["--quiet"] == ""
     assert len(printed[None].splitlines()) <= LINES
     assert printed[None].splitlines()[-1] == f"written to    {tmp_path / 'None'}"
-    titles = "Contact states", "What each log", "Parameters:", "Noise that weights the rows", "condition ", "minimized "
+    titles = (
+        "Contact states",
+        "Information lost without",
+        "Parameters:",
+        "Noise that weights the rows",
+        "condition ",
+        "minimized ",
+    )
     for title in titles:
         assert title in printed["--verbose"]
         assert title not in printed[None]

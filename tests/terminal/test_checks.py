@@ -59,9 +59,9 @@ def test_a_terminal_of_a_few_columns_gets_all_the_same() -> None:
 def test_the_verdict_comes_first_and_the_worst_finding_next_with_what_to_do() -> None:
     logs = [checked("clean", WEIGHT), checked("spiked", SPIKE, SIGN), checked("degrees", DEGREES)]
     assert text(logs).startswith(
-        "2 of 3 logs are usable, 1 of them without some samples; 1 is free of usual mistakes "
-        "rejected joint_position, unit in degrees.npz: more than two turns: degrees do: convert to radians "
-        "rejected joint_torque, spike in spiked.npz: excursions of 200 N m"
+        "2 of 3 logs are usable (1 without some samples); 1 without a mistake. "
+        "rejected joint_position (unit) in degrees.npz: more than two turns: degrees do: convert to radians "
+        "rejected joint_torque (spike) in spiked.npz: excursions of 200 N m"
     )
     rows = [line.split() for line in check_lines(logs, (), 100) if re.match(r"\w+\.npz ", line)]
     assert rows == [
@@ -72,7 +72,7 @@ def test_the_verdict_comes_first_and_the_worst_finding_next_with_what_to_do() ->
 
 
 def test_one_log_is_named_with_its_verdict() -> None:
-    assert text([checked("walk", WEIGHT)]).startswith("walk.npz: 20 samples, 0.19 s: usable; free of usual mistakes")
+    assert text([checked("walk", WEIGHT)]).startswith("walk.npz: 20 samples, 0.19 s: usable; no mistake found")
     assert text([checked("walk", SIGN)]).startswith("walk.npz: 20 samples, 0.19 s: usable suspicious ")
     assert text([checked("walk", DEGREES)]).startswith("walk.npz: 20 samples, 0.19 s: not usable: joint_position: unit")
     assert "not checked 1 check: forces against the model (no robot (--urdf))" in text([checked("walk")])
@@ -96,10 +96,10 @@ def test_what_several_logs_share_is_said_once_and_where_all_of_it_is() -> None:
     logs = [checked(f"walk_{k}", SPIKE) for k in range(4)]
     said = text(logs)
     assert said.count("leave out; check for a loose contact") == 1
-    assert "spike in walk_0.npz, likewise walk_1.npz and 2 more: excursions" in said
-    assert "all in full: --verbose" in said
+    assert "(spike) in walk_0.npz, also walk_1.npz and 2 more: excursions" in said
+    assert "full text: --verbose" in said
     again = [replace(SPIKE, field=field) for field in ("joint_position", "joint_torque")]
-    assert "joint_position, joint_torque, spike: excursions" in text([checked("walk", *again)])
+    assert "joint_position, joint_torque (spike): excursions" in text([checked("walk", *again)])
 
 
 def test_a_terminal_gets_plain_lines_of_its_width(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

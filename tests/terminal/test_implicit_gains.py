@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import mujoco
-import numpy as np
 import pytest
 from synthetic import PANDA, load
 
@@ -59,13 +58,13 @@ def run_with(kd: float | None, armature: float) -> Any:
         for k, name in enumerate(robot.joint_names)
     ]
     experiment = SimpleNamespace(config=SimpleNamespace(logs=SimpleNamespace(columns=columns)), robot=robot)
-    forces = SimpleNamespace(time=np.arange(9) * 0.005)
+    forces = SimpleNamespace(rate=1.0 / 0.005)
     return SimpleNamespace(experiment=experiment, extras=extras, forces=forces)
 
 
 def test_the_answer_names_the_cause_where_the_gain_is_stated_and_nothing_otherwise() -> None:
     (said,) = _implicit(run_with(2.0, 0.01))
-    assert said.startswith("armatures are 5 ms times the stated kd: no rotors")
+    assert said.startswith("Armatures are 5 ms times the stated kd: they come from a simulator")
     assert not list(_implicit(run_with(2.0, 0.3)))
     assert not list(_implicit(run_with(None, 0.01)))
     law = replace(run_with(2.0, 0.01).experiment.config.logs.columns.joint_torque, pd=PdLaw(kp=Gains(value={"*": 1.0})))

@@ -35,7 +35,7 @@ def test_any_number_of_motions_fits_on_a_screen(count: int, width: int) -> None:
     shown = [line.split()[0] for line in lines if line.startswith("squat_")]
     assert shown == [f"squat_{k}" for k in range(count)[::-1]][: len(shown)], "the nearest to a bound first"
     if len(shown) < count:
-        assert f"and {count - len(shown)} motions farther from the bounds: --verbose" in lines
+        assert f"and {count - len(shown)} more motions: --verbose" in lines
     assert len(shown) >= min(count, 11)
 
 
@@ -44,6 +44,6 @@ def test_the_worst_of_all_motions_comes_first_in_words() -> None:
     stood["squat"] = replace(stood["squat"], slip=0.0031, effort=0.62)
     said = " ".join(" ".join(simulation_lines(config, stood, 80)).split())
     assert said.startswith(
-        "The robot stands throughout 2 motions, 20 s: feet slip by at most 3.1 mm, "
+        "The robot stands during 2 motions (20 s): feet slip at most 3.1 mm, "
         "the zero-moment point stays 50 mm inside the support, torques reach 62 % of their limits"
     )

@@ -204,8 +204,8 @@ def _candidates_named(names: Sequence[str], field: str, offered: Sequence[Candid
         if name not in by_name:
             raise UnknownNameError.at_field(f"analysis.{field}", name, by_name)
         if len(by_name[name]) > 1:
-            reason = f"'{name}', the name of several sensors: joint, contact or fixed joint"
-            raise ConfigError.at_field(f"analysis.{field}", reason, "a name that only one sensor has")
+            reason = f"several sensors are named '{name}' (joint, contact or fixed joint)"
+            raise ConfigError.at_field(f"analysis.{field}", reason, "the name of one sensor")
     return frozenset(by_name[name][0] for name in names)
 
 
@@ -215,7 +215,7 @@ def _sets_named(setup: RobotSetup, proposed: SensorSet | None) -> dict[str, Sens
     for name, choice in setup.config.analysis.compare.items():
         field = f"analysis.compare.{name}"
         if name in sets:
-            raise ConfigError.at_field(field, "the name of what stands under sensors", "another name")
+            raise ConfigError.at_field(field, "the name of the sensors block", "another name")
         with errors_at(field, instead_of="sensors"):
             sets[name] = setup.sensors_of(choice)
     return sets
@@ -299,7 +299,7 @@ def _analysis_folder(output: Path) -> Path:
         ConfigError: the output has no name.
     """
     if not output.name:
-        raise ConfigError.at_field("output", f"'{output}', no name for a folder", "a path to a new folder")
+        raise ConfigError.at_field("output", f"'{output}' is not a folder name", "a path to a new folder")
     return output.parent / f"{output.name}.analysis"
 
 
@@ -410,8 +410,8 @@ def _sets_to_compare(
             continue
         if scalar := _chosen_along_normals(choice, setup.contacts):
             needed = f"sensors.contact_wrenches: {{{scalar[0]}: [{NORMAL_FORCE}]}}"
-            bound = f"the file's sensors do not read {', '.join(scalar)} along the normal ({needed})"
-            warn(f"{bound}; no accuracy of the {_plan_label(name)}")
+            bound = f"the sensors of the file do not read the normal force of {', '.join(scalar)} ({needed})"
+            warn(f"{bound}; the accuracy of the {_plan_label(name)} is unknown")
         else:
             sets[_plan_label(name)] = sensor_set(setup.robot, setup.contacts, choice.chosen, setup.noise)
     return sets

@@ -13,7 +13,7 @@ from torchid.config.logs import tests_on_seen_samples
 from torchid.errors import format_count, format_percent, join_names
 from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
 from torchid.estimators.least_squares import IDENTIFIED
-from torchid.fitting.fit import Confounded, list_confounded
+from torchid.fitting.fit import Comparison, list_confounded
 from torchid.fitting.noise import AT_THE_FLOOR, unexplained_joints
 from torchid.fitting.posterior import FittedPosterior
 from torchid.log_checks.contacts import MAX_MASS_ERROR
@@ -39,14 +39,13 @@ from torchid.reprs import decimal
 _FEW_GROUPS = 2
 _FEW_NAMED = 4
 _WIDTH = 108  # of a line of a summary
-_IN_PART = " in part"
 #: By the least and the largest error of a group of rows, as shares of the URDF's.
 _VERDICTS = {
     (0.5, 0.5): "Much better",
     (0.95, 0.95): "Better",
-    (0.95, np.inf): f"Better{_IN_PART}",
+    (0.95, np.inf): "Partly better",
+    (np.inf, np.inf): "No better",
 }
-_NO_BETTER = "No better"
 
 
 @dataclass(frozen=True)
@@ -75,36 +74,48 @@ class ErrorComparison:
             if before is not None and after is not None:
                 yield group, before, after, self.identified.noise.get(group)
 
-    def headline(self, unexplained: str = "") -> str:
-        """The verdict in a sentence; `unexplained`: forces of the fit that the model does not explain, in words."""
+    def headline(self, explained: bool = True) -> str:
+        """The verdict in a sentence or two; `explained`: whether the model explains the forces of the fit."""
         ratios = [after / before if before else 1.0 for _, before, after, _ in self.errors()]
         if not ratios:
-            return f"Nothing to compare with the {self.of} on {self.text}"
+            return f"No measured forces to compare with the {self.of} on {self.text}."
         least = min(ratios)
         most = max(ratios)
-        shares = f"{format_percent(least)} to " * (most > 1.1 * least) + f"{format_percent(most)} %"
-        within = (text for limits, text in _VERDICTS.items() if least < limits[0] and most < limits[1])
-        verdict = next(within, _NO_BETTER)
+        error = f"the error is {times_smaller(least, most)}"
         known = [after / floor for _, _, after, floor in self.errors() if floor]
-        floor = ", as near as the sensors' noise allows" if known and max(known) < AT_THE_FLOOR else ""
-        if unexplained:
-            return f"The model does not explain {unexplained}: errors of {shares} of the {self.of}'s on {self.text}"
-        better, parts, worse = compare_parts(self.nominal, self.identified)
+        if known and max(known) < AT_THE_FLOOR:
+            error += ", as small as the noise floor"
+        if not explained:
+            return f"The model does not explain these forces. Compared with the {self.of} on {self.text}, {error}."
         if self.at_rest:
-            judged = f"errors of {shares} of the {self.of}'s{floor}; inertia and friction are not judged"
-            return f"At rest alone, as nothing moves in {self.text}: {judged}"
+            still = f"Nothing moves in {self.text}: inertia and friction are not judged"
+            return f"{still}. Compared with the {self.of}, {error}."
+        better, parts, worse = compare_parts(self.nominal, self.identified)
         if worse:
             where = f"better in {better} of {parts} joints and base axes, worse in {join_names(worse, 1)}"
-            return f"Mixed, against the {self.of} on {self.text}: {where}"
-        words = verdict.removesuffix(_IN_PART)
-        part = _IN_PART * verdict.endswith(_IN_PART)
-        return f"{words} than the {self.of}{part} on {self.text}: errors of {shares} of the {self.of}'s{floor}"
+            return f"Mixed, compared with the {self.of} on {self.text}: {where}."
+        verdict = next(text for limits, text in _VERDICTS.items() if least < limits[0] and most < limits[1])
+        return f"{verdict} than the {self.of} on {self.text}: {error}."
 
     def shown_errors(self) -> list[tuple[str, float, float, float | None]]:
         """Errors that a user should see, by the words for their group, with units."""
         few = len(list(self.errors())) < _FEW_GROUPS  # no joint of its own, as all legs stand: their projection
         errors = self.errors((*(ERROR_GROUPS if few else DECISIVE_GROUPS), PRESSURE))
         return [(self.identified.label(group), before, after, floor) for group, before, after, floor in errors]
+
+
+def times_smaller(least: float, most: float) -> str:
+    """The least and the largest ratio of errors in words, as "4 to 14 times smaller"."""
+
+    def factors(*ratios: float) -> str:
+        texts = [f"{x:.{2 + (x < 1.995)}g}" if x < 99.5 else f"{x:.0f}" if x < 1e3 else "over 1000" for x in ratios]
+        return f"{' to '.join(dict.fromkeys(texts))} times"
+
+    most_smaller = 1.0 / max(least, _EXACT_SHARE**2)
+    if most < 1.0:
+        return f"{factors(1.0 / most, most_smaller)} smaller"
+    larger = f"{factors(*(least, most) if least >= 1.0 else (most,))} larger"
+    return larger if least >= 1.0 else f"{larger} to {factors(most_smaller)} smaller"
 
 
 _LARGER_THAN_MEASURED = 1.05  # errors over the measured, of sensors that any fit of their limb explains better
@@ -124,11 +135,11 @@ class Answer:
     """What a run says first.
 
     Attributes:
-        headline: how much better than the URDF it predicts, and what.
+        headline: how much better than the URDF it predicts.
         errors: groups of rows with the rms errors of the URDF's and of the identified parameters, and what noise of the
             readings leaves, None where it is not known.
         total_mass: with its standard error, beside the URDF's.
-        bodies: whether all can exist.
+        bodies: whether all are physically consistent.
         attention: what the user should look at, the most urgent first.
         terms: of the actuators that the logs have chosen, "" where they chose none of their own.
     """
@@ -144,8 +155,9 @@ class Answer:
 def answer(run: Results) -> Answer:
     """The answer of a finished run."""
     judged = _judge(run)
+    explained = not any((*_unlike_sensors(judged.identified), *_unlike_joints(run)))
     return Answer(
-        headline=_headline(run, judged),
+        headline=describe_worse(run.worse, judged.of) or judged.headline(explained),
         errors=judged.shown_errors(),
         total_mass=_total_mass(run),
         bodies=_bodies_text(run),
@@ -163,18 +175,13 @@ def summary_lines(run: Results) -> list[str]:
     said = [("data", f"{format_count(run.samples, 'sample')} of {format_count(len(config.logs.train), 'log')}")]
     said += [("parameters", f"{estimate.phi.size}: {counts}")]
     if not robot.fixed_base:
-        said.append(("total mass", f"{run.mass} ({robot.format}: {decimal(run.mass.nominal)} kg)"))
+        said.append(("total mass", _total_mass(run)))
     sets = {name: (pair.identified, pair.nominal) for name, pair in run.metrics.items()}
     if run.validation is not None:
         sets["left out"] = (run.validation.identified, run.validation.nominal)
-    for name, (identified, nominal) in sets.items():
-        texts = (describe_errors(group, identified.rms_of(group), nominal.rms_of(group)) for group in DECISIVE_GROUPS)
-        said.append((name, "; ".join(filter(None, texts))))
-    trouble = [
-        *([f"WORSE THAN {robot.format}: {describe_worse(run.worse, robot.format)}"] if run.worse else []),
-        str(run.misfit),
-    ]
-    said += [("attention", "; ".join(filter(None, trouble)))] if any(trouble) else []
+    said += [(name, describe_errors(nominal, identified)) for name, (identified, nominal) in sets.items()]
+    trouble = filter(None, [describe_worse(run.worse, robot.format), str(run.misfit)])
+    said += [("attention", text)] if (text := "; ".join(trouble)) else []
     said.append(("written to", str(config.output or "no folder: write(folder), to_urdf(file)")))
     title = f"{robot.path.name}, {len(run)} bodies, {format_count(robot.n, 'joint')}, by {config.estimator.name}"
     lines = (f"{label:12}{shorten(text, _WIDTH, placeholder=' ...')}" for label, text in said)
@@ -185,52 +192,39 @@ def _total_mass(run: Results) -> str:
     gain = run.experiment.config.sensors.gain_error
     file_kind = run.experiment.robot.format
     counted = run.mass.determined and run.estimate.gain_error is not None and run.estimate.gain_error.any()
-    gains = f"; ± counts gain errors of {100.0 * gain:g} %" if counted else ""
+    gains = f"; ± includes {100.0 * gain:g} % gain error" if counted else ""
     return f"{run.mass} ({file_kind}: {decimal(run.mass.nominal)} kg{gains})"
 
 
 def _judge(run: Results) -> ErrorComparison:
-    file_kind = run.experiment.robot.format
-    if "test" in run.metrics:
+    name = "test" if "test" in run.metrics else "train"
+    pair = run.metrics[name]
+    at_rest = name in run.at_rest
+    text = "the training logs themselves"
+    if name == "test":
         files = run.experiment.config.logs
-        names = [log_title(path) for path in files.test]
-        motion = "motion that the fit has seen" if tests_on_seen_samples(files) else "unseen motion"
-        at_rest = "test" in run.at_rest
-        text = f"{'the test logs' if at_rest else motion} ({join_names(names, 2)})"
-        return ErrorComparison(text, run.metrics["test"].nominal, run.metrics["test"].identified, file_kind, at_rest)
-    if run.validation is not None:
-        text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
-        return ErrorComparison(
-            text, run.validation.nominal, run.validation.identified, file_kind, "train" in run.at_rest
-        )
-    nominal, identified = run.metrics["train"]
-    return ErrorComparison("the training logs themselves", nominal, identified, file_kind, "train" in run.at_rest)
-
-
-def _headline(run: Results, judged: ErrorComparison) -> str:
-    if run.worse:
-        return f"WORSE THAN {judged.of}: {describe_worse(run.worse, judged.of)}"
-    explained = not any((*_unlike_sensors(judged.identified), *_unlike_joints(run)))
-    return judged.headline("" if explained else "these forces")
+        motion = "training motion" if tests_on_seen_samples(files) else "unseen motion"
+        text = f"{'the test logs' if at_rest else motion} ({join_names([log_title(path) for path in files.test], 2)})"
+    elif run.validation is not None:
+        pair = Comparison(run.validation.nominal, run.validation.identified)
+        text = f"{run.validation.folds} held-out blocks of the training logs"
+    return ErrorComparison(text, pair.nominal, pair.identified, run.experiment.robot.format, at_rest)
 
 
 def _bodies_text(run: Results) -> str:
-    names = []
     robot = run.experiment.robot
-    for violation in run.violations:
-        if violation.body is not None and robot.body_names[violation.body] not in names:
-            names.append(robot.body_names[violation.body])
     count = len(robot.body_names)
     if all(violation.term is not None for violation in run.violations):
         ends = massless_ends(robot, run.phi)
         if ends:
-            return f"all that have mass can exist; MuJoCo refuses joints that move none: {join_names(ends)}"
+            return f"physically consistent, but MuJoCo refuses joints that move no mass: {join_names(ends)}"
         if run.refused:
-            return f"all {count} can exist, but simulators refuse their file: {run.refused}"
-        return f"all {count} can exist, and simulators take them"
-    which = f"{len(names)} of {count}" if names else "all together"
-    advice = "; estimator.name=consistent finds the best that can" if type(run.estimate) is Estimate else ""
-    return f"{which} cannot exist, and simulators refuse them{advice}"
+            return f"all {count} physically consistent, but MuJoCo refuses the file: {run.refused}"
+        return f"all {count} physically consistent; load in MuJoCo"
+    bodies = {violation.body for violation in run.violations} - {None}
+    which = f"{len(bodies)} of {count}" if bodies else "all together"
+    advice = ". Use estimator.name=consistent" if type(run.estimate) is Estimate else ""
+    return f"{which} not physically consistent; simulators refuse them{advice}"
 
 
 def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
@@ -246,7 +240,8 @@ def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
     is_off = abs(mass.value - mass.nominal) > MAX_MASS_ERROR * mass.nominal
     contradicts = run.experiment.config.estimator.total_mass is None and mass.determined and is_clear and is_off
     is_open = not mass.determined and (is_off or not run.experiment.robot.fixed_base)
-    let = f", and the fit lets it be {decimal(mass.value)} kg ({decimal(mass.nominal)} kg by the {file_kind})" * is_off
+    fitted = f" (the fit: {decimal(mass.value)} kg, {file_kind}: {decimal(mass.nominal)} kg)" * is_off
+    adopted = run.choices.adopted_terms
     independent = f"{run.samples / estimate.oversampling:.0f} independent samples"
     rules = (
         (bool(run.worse), ADVICE),
@@ -254,81 +249,75 @@ def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
         *((True, text) for text in _unfinished(estimate)),
         *((True, text) for text in _unlike_sensors(judged.identified)),
         *((True, text) for text in _computed(judged)),
-        (bool(terms), f"negative, which nothing is: {join_names(terms)}; estimator.name=consistent finds the best "
-                      "that can be"),
+        (bool(terms), f"The fit makes {join_names(terms)} negative: impossible. Use estimator.name=consistent."),
         (growth > _MUCH_MORE and (run.misfit.share or 0.0) > _EXACT_SHARE,
-         f"no bodies that can exist explain these forces: they leave {growth:.2g} times as much as bodies that cannot; "
-         "unit, gear or sign of a torque? (torchid check)"),
+         f"No physically consistent bodies explain these forces: their residuals are {growth:.2g} times those of other "
+         "bodies. Check unit, gear and sign of the torques: torchid check."),
         *((True, text) for text in _driving(run)),
         *((True, text) for text in _unlike_joints(run)),
         *((True, text) for text in _heavy(run)),
         (not run.misfit.explained,
-         "friction, compliance or contacts are missing, or a sensor is wrong (torchid check): "
-         f"{run.misfit.in_short}"),
+         f"Friction, compliance or contacts are missing, or a sensor is wrong (torchid check): {run.misfit.in_short}"),
         *((True, text) for text in _resting(run)),
-        (contradicts, f"the total mass is {ratio:.3g} times the {file_kind}'s: weigh the robot, or mend units and "
-                      "gains of forces: torchid check"),
+        (contradicts, f"The total mass is {ratio:.3g} times the {file_kind}'s. Weigh the robot, or correct units and "
+                      "gains of forces: torchid check."),
         (not run.misfit.judged,
-         "whether the model explains these forces is not known: no noise is stated, and the logs are too short to tell "
-         "it from errors of the model; state sensors.noise, or record more"),
+         "It is unknown whether the model explains these forces: no noise is stated, and the logs are too short. State "
+         "sensors.noise, or record more."),
         (estimate.block_error is None,
-         f"95 % intervals count noise alone, no error of the model, which {independent} do not show: record more"),
-        (is_open, f"these data do not determine the total mass{let}; weigh the robot: estimator.total_mass"),
+         f"95 % intervals include noise only, no model errors: {independent} are too few. Record more."),
+        (is_open, f"These data do not determine the total mass{fitted}. Weigh the robot: estimator.total_mass."),
         *((True, text) for text in _implicit(run)),
-        *((True, confounded.in_short) for confounded in _confounded(run)),
+        *((True, x.in_short) for x in list_confounded([x for x in run.extras if x.extra.what not in adopted])),
         *((True, text) for text in _far_off(run.posterior)),
-        (bool(run.noise.suggested), f"noise: {noise_advice(run.noise.suggested)}"),
+        (bool(run.noise.suggested), noise_advice(run.noise.suggested)),
     )  # fmt: skip
     return (text for applies, text in rules if applies)
 
 
-def _confounded(run: Results) -> Sequence[Confounded]:
-    return list_confounded([x for x in run.extras if x.extra.what not in run.choices.adopted_terms])
-
-
 def _unfinished(estimate: Estimate) -> Iterator[str]:
-    """How far above the least objective under the same conditions a descent ended."""
+    """How far above the optimum a descent ended."""
     if isinstance(estimate, SgdEstimate) and not estimate.converged:
-        share = "an unknown" if estimate.excess is None else f"{100.0 * estimate.excess:.2g}"
-        advice = "more estimator.training.epochs, or estimator.name=consistent"
-        yield f"not converged: {share} % above the optimum; {advice}"
+        above = "" if estimate.excess is None else f": {100.0 * estimate.excess:.2g} % above the optimum"
+        yield f"Not converged{above}. Raise estimator.training.epochs, or use estimator.name=consistent."
 
 
 def _resting(run: Results) -> Iterator[str]:
-    """That joints rest where forces are not explained, or all the time where their torques count as unmeasured then."""
+    """That joints rest where forces are not explained, or all the time where actuators.stiction leaves out rest."""
     if run.experiment.config.actuators.stiction:
         if still := [name for name, share in run.resting.items() if share == 1.0]:
-            names = join_names(still, _FEW_NAMED)
-            why = "no torque counts as measured then (actuators.stiction)"
-            yield f"no friction of {names}: at rest, or too near to it for the filter, throughout; {why}"
+            yield (
+                f"No friction is identified of {join_names(still, _FEW_NAMED)}: they always rest, or almost, and "
+                "actuators.stiction leaves out joints at rest. Record more motion."
+            )
     elif run.resting and not run.misfit.explained:
         names = join_names([f"{name} {100.0 * share:.0f} %" for name, share in run.resting.items()], _FEW_NAMED)
-        why = "where one sticks, its friction is less than Coulomb's, and too little is found"
-        yield f"actuators.stiction=true, as joints rest ({names}): {why}"
+        yield f"Friction is underestimated, as joints rest ({names}). Set actuators.stiction=true."
 
 
 def _unlike_sensors(identified: Metrics) -> Iterator[str]:
-    """Readings that the identified parameters explain worse than no bodies, or a constant base force, would."""
+    """Readings that the identified parameters predict worse than no bodies, or a constant base force, would."""
     for group in (*LIMB_GROUPS, "nullspace"):
         share = identified.relative_of(group)
         if share is not None and share > _LARGER_THAN_MEASURED:
-            in_limb = group in LIMB_GROUPS
-            name = group_name(group) if in_limb else "forces without those of the contacts"
-            whose = "the sensor's sign, unit and frame" if in_limb else "signs, units and order of joints"
-            yield f"{name}: errors of {share:.2g} times what was measured; check {whose}: torchid check"
+            what = "sign, unit and frame of the sensor" if group in LIMB_GROUPS else "signs, units and order of joints"
+            name = group_name(group)
+            yield f"The error of the {name} is {share:.2g} times the measured value. Check {what}: torchid check."
     share = identified.base_force_of_variation
     of_weight = identified.relative_of("base_force")
     if share is not None and share > _LARGER_THAN_MEASURED and (of_weight or 0.0) > MAX_MASS_ERROR:
-        ratio = f"base force: errors of {share:.2g} times what its measurements vary by"
-        yield f"{ratio}; check frames, signs and units of contact forces and of the base's pose: torchid check"
+        yield (
+            f"The error of the base force is {share:.2g} times the variation of its measured value. Check frames, "
+            "signs and units of contact forces and base pose: torchid check."
+        )
 
 
 def _computed(judged: ErrorComparison) -> Iterator[str]:
-    """That the robot's file itself predicts the forces better than any file predicts those of a real robot."""
+    """That the robot's file itself predicts the forces better than is possible for a real robot."""
     shares = [share for group in ERROR_GROUPS if (share := judged.nominal.relative_of(group)) is not None]
     if shares and max(shares) < _COMPUTED:
         to = f"to {format_percent(max(shares))} %"
-        yield f"the {judged.of} predicts these forces {to}: were they computed from it, or commanded, not measured?"
+        yield f"The {judged.of} predicts these forces {to}. Are they computed from it, or commands, not measurements?"
 
 
 def _heavy(run: Results) -> Iterator[str]:
@@ -341,8 +330,10 @@ def _heavy(run: Results) -> Iterator[str]:
     heavy = np.flatnonzero((mass > _HEAVY * nominal) & (nominal > 0.0) & ~known)
     ratio = mass[heavy] / nominal[heavy]
     if named := [f"{robot.body_names[heavy[k]]} {ratio[k]:.2g} times" for k in np.argsort(-ratio)]:
-        why = f"which the data do not determine: an estimator.ridge above {run.experiment.config.estimator.ridge}"
-        yield f"{join_names(named, _FEW_NAMED)} the {robot.format}'s mass, {why}"
+        yield (
+            f"Masses that the data do not determine are large: {join_names(named, _FEW_NAMED)} the {robot.format}'s. "
+            f"Raise estimator.ridge above {run.experiment.config.estimator.ridge}."
+        )
 
 
 def _driving(run: Results) -> Iterator[str]:
@@ -351,11 +342,14 @@ def _driving(run: Results) -> Iterator[str]:
     bodies = np.array(run.experiment.robot.bodies, object)[value < -_CLEAR_ERRORS * error]
     if len(bodies) and (run.misfit.share or 0.0) > _EXACT_SHARE:
         names = join_names([body.joint.name for body in bodies], _FEW_NAMED)
-        yield f"friction drives {names}: its torque is reversed, or its friction of another shape: torchid check"
+        yield (
+            f"The Coulomb friction of {names} is negative: the torque is reversed, or friction has another shape. Run "
+            "torchid check."
+        )
 
 
 def _implicit(run: Results) -> Iterator[str]:
-    """That armatures are those which a simulator's implicit integration of a PD law adds, where its kd is stated."""
+    """That armatures come from a simulator's implicit integration of a PD law, where its kd is stated."""
     logs = run.experiment.config.logs
     robot = run.experiment.robot
     torque = logs.columns.joint_torque if logs.columns else None
@@ -365,13 +359,16 @@ def _implicit(run: Results) -> Iterator[str]:
     known = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
     added = {x.extra.name: x.value - known[x.extra.name] for x in run.extras if x.extra.what == "armature"}
     if step := implicit_step(kd, added, 1.0 / run.forces.rate):
-        yield f"armatures are {1e3 * step:.2g} ms times the stated kd: no rotors, but a simulator's implicit PD law"
+        yield (
+            f"Armatures are {1e3 * step:.2g} ms times the stated kd: they come from a simulator's implicit PD law, not "
+            "from rotors."
+        )
 
 
 def implicit_step(kd: Mapping[str, float], armatures: Mapping[str, float], step: float) -> float | None:
-    """The time [s] by which armatures [kg m^2] are the gains kd [N m s/rad] times it; None for a coincidence.
+    """The time [s] that turns gains kd [N m s/rad] into the armatures [kg m^2]; None for a coincidence.
 
-    It is none where gains differ and armatures go with them, or where the time is the step of the samples.
+    It is no coincidence where gains differ and armatures with them, or where the time is the step of the samples.
     Source: MuJoCo's integrators, (M + h kd) a = f for a damping of kd and a step of h.
     """
     gains = np.array([gain for name, gain in kd.items() if gain > 0.0 and name in armatures])
@@ -385,22 +382,22 @@ def implicit_step(kd: Mapping[str, float], armatures: Mapping[str, float], step:
 
 
 def _unlike_joints(run: Results) -> Iterator[str]:
-    """That the fit leaves much of the torque of single joints of a bolted robot."""
+    """That the fit leaves much of the torque of single joints of a robot with a fixed base."""
     fitted = run.metrics["train"].identified
     if run.experiment.robot.fixed_base and (joints := unexplained_joints(fitted)):
         shares = fitted.by_joint_relative
         named = join_names([f"{format_percent(shares[name] or 0.0)} % of the torque of {name}" for name in joints])
-        yield f"the fit leaves {named}; check sign, unit and gear there, and its encoder: torchid check"
+        yield f"The model does not explain {named}. Check sign, unit, gear and encoder there: torchid check."
 
 
 def _far_off(fitted: FittedPosterior) -> Iterator[str]:
-    """That bodies are further off their file than samples of what data leave open take them to be."""
+    """That bodies are further off their file than the prior of `torchid sample` assumes."""
     nominal = fitted.nominal_error
     if nominal is not None and nominal.prior_is_narrow:
-        causes = ["the model does not explain these forces", "the file is another robot's"]
+        causes = ["the model does not explain these forces", "the file is of another robot"]
         if thin := [
             name for name, is_thin in zip(fitted.body_names, fitted.posterior.thin_bodies(), strict=True) if is_thin
         ]:
             causes.append(f"it has rods or plates ({join_names(thin)})")
         why = f": {', '.join(causes[:-1])}, or {causes[-1]}" if nominal.value > _ANOTHER_ROBOT else ""
-        yield f"{nominal}{why}; other bodies may be as far off: torchid sample --prior-error auto"
+        yield f"{nominal}{why}. Other bodies may be as far off: use torchid sample --prior-error auto."

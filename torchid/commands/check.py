@@ -86,13 +86,13 @@ def check_files(
     given = [name for name, value in options.items() if value]
     if Path(path).suffix.lower() in EXPERIMENTS:
         if given:
-            raise ConfigError("command line", given[0], "given with an experiment file", "overrides, robot.urdf=...")
+            raise ConfigError("command line", given[0], "not used with an experiment file", "overrides, robot.urdf=...")
         return check_experiment(path, overrides)
     if overrides:
-        reason = f"{overrides[0]}, given with a log"
+        reason = f"{overrides[0]} is not used with a log"
         raise ConfigError("command line", "overrides", reason, f"an experiment file ({', '.join(EXPERIMENTS)})")
     if urdf is None and (base_link or fixed_base):
-        raise ConfigError("command line", given[0], "given without a robot", "--urdf too")
+        raise ConfigError("command line", given[0], "needs a robot", "--urdf too")
     return [check_log(path, urdf, base_link, fixed_base, topics, columns)]
 
 
@@ -206,15 +206,15 @@ def _segment_name(path: Path, segment: slice, samples: int) -> str:
     name = log_title(path)
     if segment.stop - segment.start == samples:
         return name
-    return f"{name} (samples {segment.start} to {segment.stop - 1} of {samples}, counted from there)"
+    return f"{name} (samples {segment.start} to {segment.stop - 1} of {samples}, numbered from there)"
 
 
 def _require_memory(path: Path, settings: PreprocessingConfig) -> None:
     """Refuse a log that is larger than what may be in memory at once."""
     size = memory_needed(path, settings.memory_gb)
     if size > settings.memory_gb:
-        accepted = f"parts of the log, or an experiment file with a preprocessing.memory_gb above {size:.2g}"
-        raise LogError(path, "file", f"arrays of {size:.2g} GB, which are not in memory at once", accepted)
+        accepted = f"parts of the log, or an experiment file with preprocessing.memory_gb above {size:.2g}"
+        raise LogError(path, "file", f"arrays of {size:.2g} GB do not fit in memory", accepted)
 
 
 def _contact(log: Log, index: int, shapes: CollisionShapes) -> ContactConfig:

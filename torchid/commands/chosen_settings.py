@@ -74,7 +74,7 @@ class SampleRates:
 
     def __str__(self) -> str:
         rates = dict.fromkeys(f"{rate:.4g} Hz" for rate in self.rates_hz.values())
-        return f"{join_names(list(rates))}: every k-th sample at {LOSSLESS_RATE:g} cutoffs or more"
+        return f"{join_names(list(rates))}: every k-th sample, at least {LOSSLESS_RATE:g} times the cutoff"
 
 
 @dataclass
@@ -102,11 +102,11 @@ class Choices:
         """What the logs have added to the model, and what nearly, in one line; "" for nothing."""
         named = [] if self.terms is None else [str(self.terms)]
         if self.stiction is not None and self.stiction.value:
-            named.append("samples at rest left out")
+            named.append("samples at rest are left out")
         if self.sign_width is not None and self.sign_width.value is not None:
-            named.append(f"Coulomb friction over {self.sign_width.value:.2g} rad/s")
+            named.append(f"Coulomb friction follows tanh(velocity / {self.sign_width.value:.2g} rad/s)")
         if self.delay is not None and self.delay.value:
-            named.append(f"torques {1e3 * self.delay.value:.3g} ms late")
+            named.append(f"torques act {1e3 * self.delay.value:.3g} ms late")
         return "; ".join(text for text in named if text != "none")
 
     def by_name(self) -> dict[str, object]:

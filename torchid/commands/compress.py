@@ -80,7 +80,7 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
         BaseLostError: the sensors cannot see the base.
     """
     if "://" in str(output):
-        raise ConfigError(output, "output", "a URL", "a folder on this machine, to be copied from there")
+        raise ConfigError(output, "output", "a URL", "a local folder (copy it from there)")
     output = Path(output)
     config.logs.require_samples("compress")
     distributed.from_first(partial(check_free, output, config.overwrite, COMPRESSED, inputs_of(config)), "output")
@@ -110,8 +110,8 @@ def _file_names(logs: Sequence[Path]) -> list[str]:
     names = [f"{split_range(log).name}{FACTORS}" for log in logs]
     again = [name for name in names if names.count(name) > 1]
     if again:
-        reason = f"several logs that would become {excerpt(again[0])}"
-        raise ConfigError.at_field("logs.train", reason, "logs of different names, or several calls")
+        reason = f"several logs have the file name {excerpt(again[0])}"
+        raise ConfigError.at_field("logs.train", reason, "logs with different names, or several calls")
     return names
 
 

@@ -99,18 +99,12 @@ class EvaluatedRun:
         if not far:
             return None
         name, group = worst = max(far, key=lambda key: (key[1] != WHITENED, far[key]))  # in N or N m, if it can be
-        what = "projected forces" if group == WHITENED else group_name(group)
-        text = f"{name}: the error of the {what} is {far[worst]:.0f} times that on the run's own logs"
-        return f"{text}: another robot, a payload, other friction or a mistake in this log; torchid check"
+        text = f"{name}: the error ({group_name(group)}) is {far[worst]:.0f} times that on the run's own logs"
+        return f"{text}. Is it another robot, a payload or another friction? Check this log: torchid check."
 
     def _headline(self) -> str:
-        texts = [
-            f"{name}: {describe_errors(group, pair.identified.rms_of(group), pair.nominal.rms_of(group))}"
-            for name, pair in self.metrics.items()
-            for group in DECISIVE_GROUPS
-            if pair.identified.rms_of(group) is not None
-        ]
-        return f"identified against {self.robot.format}; {'; '.join(texts)}"
+        texts = [f"{name}: {describe_errors(*pair)}" for name, pair in self.metrics.items()]
+        return f"{self.robot.format} -> identified; {'; '.join(texts)}"
 
     def to_dict(self) -> dict[str, dict[str, object]]:
         """Content of `metrics.json`, by log name."""
@@ -179,7 +173,7 @@ def evaluate(
     with progress_bars() as bars:
         fitted = read_run(folder, device)
         if not fitted.usual:
-            warn(f"{folder / _METRICS}: no figures of the run; projected forces are weighed with a guess of the noise")
+            warn(f"{folder / _METRICS}: not readable. Whitened residuals use a guess of the noise.")
         evaluated = replace(_evaluate(fitted, logs, folder, bars), output=place)
         if place is not None:
             form = fitted.experiment.config.figures.format
@@ -191,7 +185,7 @@ def evaluate(
 def require_run(folder: Path) -> None:
     """Make sure that a folder is that of a run. Raises ConfigError: it has no settings."""
     if not (folder / _SETTINGS).is_file():
-        raise ConfigError(folder, "RUN", f"no {_SETTINGS} in it", "a folder that torchid identify wrote")
+        raise ConfigError(folder, "RUN", f"{_SETTINGS} is missing", "a folder written by torchid identify")
 
 
 def read_run(folder: Path, device: str | None = None) -> FittedRun:
@@ -261,7 +255,7 @@ def _evaluate(fitted: FittedRun, logs: Sequence[str | Path], folder: Path | None
             freed = learned.without_residual(log)
             (with_residual[split_range(log.source).name],) = scorer.score([freed], {log.fold: [with_module]})
         if not any(x is not None for x in pair.identified.rms.values()):
-            warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
+            warn(f"{log.source}: predictions cannot be compared: no joint torques and no contact wrenches.")
     excluded = {split_range(path).name: count for path, count in reader.excluded.items()}
     forces = distributed.from_first(partial(compare_forces, evaluation, samples[0], compared), "forces")
     return EvaluatedRun(
@@ -308,7 +302,7 @@ def _log_names(logs: Sequence[str | Path]) -> list[str]:
     """Names of the logs, without their folders. Raises ConfigError: two have the same, or there is none."""
     names = [split_range(log).name for log in logs]
     if not names:
-        raise ConfigError.at_field("logs", "none", "logs to evaluate")
+        raise ConfigError.at_field("logs", "none given", "logs to evaluate")
     again = [name for name in names if names.count(name) > 1]
     if again:
         raise ConfigError.at_field("logs", f"several logs named '{again[0]}'", "logs of different names")
@@ -323,7 +317,7 @@ def _output(run: Path, logs: Sequence[str | Path], given: Path | None, overwrite
     """
     name = _log_names(logs)[0]
     if given is None and name in (".", ".."):
-        raise ConfigError.at_field("logs", f"'{logs[0]}', whose name is of dots alone", "another name of the file")
+        raise ConfigError.at_field("logs", f"'{logs[0]}' has a name of dots", "another file name")
     output = run / EVALUATIONS / name if given is None else given
     inputs = [file.path for log in logs for file in split_range(log).files]
 

@@ -47,7 +47,7 @@ def export(run: str | Path, form: str, output: str | Path | None = None, overwri
     if target is not None:
         check_free_file(target, "--output", overwrite, [folder, *inputs_of(fitted.experiment.config)])
     if fitted.learned is not None:
-        warn(f"{form}: bodies and friction alone; the learned module goes by torch.export of torchid.RigidPlusResidual")
+        warn(f"{form}: bodies and friction only. For the learned module use torch.export of torchid.RigidPlusResidual.")
     robot = fitted.experiment.robot
     identified = fitted.calibrations.identified
     joints = FittedJoints.of(identified.of_joints, identified.builder.tree.stribeck)
@@ -74,17 +74,17 @@ def robot_text(form: str, robot: Robot, phi: Array, fitted: FittedJoints, folder
         return json.dumps(parameters_export(robot, phi, joints), indent=1, allow_nan=False) + "\n"
     if at_rest := [joint.name for joint in joints if joint.stribeck]:
         most = max(joint.stribeck for joint in joints)
-        warn(f"{form.upper()}: has no Stribeck friction, which {join_names(at_rest)} have, up to {most:.3g} N m (N): "
-             "its friction at rest is Coulomb's alone; --format isaaclab or json says it")  # fmt: skip
+        warn(f"{form.upper()}: Stribeck friction of {join_names(at_rest)} is lost, up to {most:.3g} N m (N) at rest. "
+             "Use --format isaaclab or json.")  # fmt: skip
     if form == "mjcf" and not is_mjcf(robot.path):
         return _mjcf_of_urdf(robot, phi, fitted).decode()
     if refused := refused_by_simulators(robot, phi, fitted):
-        warn(f"{form.upper()}: simulators refuse it: {refused}")
+        warn(f"{form.upper()}: MuJoCo refuses it: {refused}")
     if form == "mjcf":
         return identified_robot(robot, phi, fitted).decode()
     lost = [joint.name for joint in joints if joint.armature]
     if lost:
-        warn(f"URDF: has no armature, which {join_names(lost)} have: --format mjcf or isaaclab says it")
+        warn(f"URDF: the armature of {join_names(lost)} is lost. Use --format mjcf or isaaclab.")
     return identified_urdf(robot, phi).decode()
 
 

@@ -55,7 +55,7 @@ _TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # by another run
 _TRIES = 100
 _MOST_NAMES = 50  # in one message
 _MAX_MANIFEST_BYTES = 2**24  # that of 100 000 files
-_PLACE = "a place that can be written"
+_PLACE = "a folder with write permission"
 
 
 # ------------------------------------------------------------------------------------------------------- what is there
@@ -192,14 +192,14 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: It
         above = next(path for path in output.absolute().parents if path.exists())
         taken = output.is_symlink() or (output.exists() and not output.is_dir())
     except (OSError, ValueError) as error:
-        raise ConfigError(output, "output", f"no name for a folder ({error})", "a path to a new folder") from error
+        raise ConfigError(output, "output", f"not a folder name ({error})", "a path to a new folder") from error
     if taken:
         reason = "a link" if output.is_symlink() else "a file of this name exists"
         raise ConfigError(output, "output", reason, "a folder that does not exist yet")
     if output.name in ("", ".."):
-        raise ConfigError(output, "output", "no name for a folder", "a path to a new folder")
+        raise ConfigError(output, "output", "not a folder name", "a path to a new folder")
     if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)) or len(os.fsencode(output.name)) > _LONGEST_NAME:
-        raise ConfigError(output, "output", f"no folder can be made there, in {above}", _PLACE)
+        raise ConfigError(output, "output", f"cannot create a folder in {above}", _PLACE)
     if names and not overwrite:
         raise ConfigError(output, "output", "not empty", f"a new folder, or {kind.replace}")
     if names:
@@ -224,20 +224,20 @@ def check_free_file(
     """
     if os.path.lexists(path) and not (overwrite and os.path.isfile(path) and not os.path.islink(path)):
         reason = "a link" if os.path.islink(path) else "exists"
-        raise ConfigError(path, field, reason, f"a new file, or {option} in place of a file")
+        raise ConfigError(path, field, reason, f"a new file, or {option} to replace a file")
     if not os.path.isdir(path.parent):
-        raise ConfigError(path, field, f"no folder {path.parent}", "a file in an existing folder")
+        raise ConfigError(path, field, f"the folder {path.parent} does not exist", "a file in an existing folder")
     target = os.path.realpath(path)
     for other in inputs:
         read = os.path.realpath(str(other))
         if os.path.lexists(path) and (target == read or target.startswith(read + os.sep)):
-            raise ConfigError(path, field, "is or belongs to what is read", "another file")
+            raise ConfigError(path, field, "this is an input, or in an input folder", "another file")
 
 
 def refuse_link(folder: Path) -> None:
     """Refuse a link as a folder in which files are written and removed. Raises ConfigError: it is one."""
     if folder.is_symlink():
-        raise ConfigError(folder, "output", "a link", "a folder, or none")
+        raise ConfigError(folder, "output", "a link", "a folder that is not a link")
 
 
 def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
@@ -250,8 +250,8 @@ def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
     for path in (current_file(), *inputs):
         target = os.path.realpath(str(path))
         if os.path.lexists(str(path)) and target.startswith(top + os.sep):
-            reason = f"holds {excerpt(os.path.relpath(target, top))}, which is an input"
-            raise ConfigError(output, "output", reason, "another output, or inputs that lie elsewhere")
+            reason = f"contains the input {excerpt(os.path.relpath(target, top))}"
+            raise ConfigError(output, "output", reason, "another output, or inputs in another folder")
 
 
 def require_replaceable(folder: Path, kind: FolderKind, output: Path | None = None) -> FolderContents:
@@ -273,17 +273,17 @@ def require_replaceable(folder: Path, kind: FolderKind, output: Path | None = No
     except OSError as error:
         raise ConfigError(output, "output", f"cannot be read ({error})", "a new folder") from error
     if contents is None and (other := read_manifest(folder)):
-        raise ConfigError(output, "output", f"holds {excerpt(other.kind)}", accepted)
+        raise ConfigError(output, "output", f"contains {excerpt(other.kind)}", accepted)
     if contents is None:
-        reason = f"holds {join_names(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
+        reason = f"contains {join_names(names, _MOST_NAMES)}, but no {MANIFEST} of {kind.name}"
         raise ConfigError(output, "output", reason, accepted)
-    unsafe = {"which torchid did not write": contents.foreign, "changed since torchid wrote it": contents.changed}
-    complaints = [f"{join_names(paths, _MOST_NAMES)}, {what}" for what, paths in unsafe.items() if paths]
+    unsafe = {"not written by torchid": contents.foreign, "changed since torchid wrote it": contents.changed}
+    complaints = [f"{join_names(paths, _MOST_NAMES)} ({what})" for what, paths in unsafe.items() if paths]
     closed = [str(path) for path in contents.folders if not os.access(path, os.W_OK | os.X_OK)]
-    complaints += [f"{join_names(closed)}, where nothing can be removed"] if closed and not complaints else []
+    complaints += [f"{join_names(closed)} (no write permission)"] if closed and not complaints else []
     if complaints:
-        reason = f"holds {' and '.join(complaints)}"
-        raise ConfigError(output, "output", reason, f"{accepted}; move elsewhere what is yours")
+        reason = f"contains {' and '.join(complaints)}"
+        raise ConfigError(output, "output", reason, f"{accepted}; move your own files first")
     return contents
 
 
@@ -366,7 +366,7 @@ def _creation_errors_explained(output: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ConfigError(output, "output", f"no folder can be made there ({error.strerror})", _PLACE) from error
+        raise ConfigError(output, "output", f"cannot create a folder there ({error.strerror})", _PLACE) from error
 
 
 def _put(folder: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
@@ -391,7 +391,7 @@ def _put(folder: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
         contents.remove()
         if done:
             return
-    raise ConfigError(output, "output", "other runs take the place again and again", "another output")
+    raise ConfigError(output, "output", "other runs keep writing there", "another output")
 
 
 def _renamed(folder: Path, name: Path) -> bool:
@@ -418,8 +418,8 @@ def claim_folder(folder: Path) -> Iterator[None]:
             try:
                 handle = lock(path, os.O_RDWR | os.O_CREAT)
             except (BlockingIOError, FileNotFoundError) as error:
-                accepted = "another output, or patience"
-                raise ConfigError(folder, "output", "another run is at work there", accepted) from error
+                accepted = "another output, or wait until it ends"
+                raise ConfigError(folder, "output", "another run is writing there", accepted) from error
         try:
             yield
         finally:

@@ -186,8 +186,8 @@ def _judged(fit: Fit, fitter: LogFitter, data: TrainingData, checked: TrainingLo
     warn_of_confounded([x for x in fit.extras if x.extra.what not in data.choices.adopted_terms])
     warn_of_masked(fit.parts, fitter.builder)
     if experiment.sensors.task_weights is not None and fit.jackknife is None:  # its errors alone know of weights
-        reason = f"set, of logs of fewer than {LEAST_BLOCKS} blocks, whose scatter intervals come from"
-        raise ConfigError.at_field("estimator.task_weights", reason, "longer logs, or no such key")
+        reason = f"needs {LEAST_BLOCKS} blocks of the logs for its intervals"
+        raise ConfigError.at_field("estimator.task_weights", reason, "longer logs, or leave it out")
     return fit, mass
 
 
@@ -357,6 +357,6 @@ def _robust(fit: Fit, data: TrainingData, fitter: LogFitter, bars: Progress) -> 
     robust = fit_robustly(train, fitter, loss, first=fit, parts=data.parts, progress=partial(bars.advance, bar))
     bars.update(bar, total=1, completed=1)
     if not robust.summary.converged:
-        message = f"estimator.robust: not converged after {robust.summary.passes} passes; accepted: more passes"
+        message = f"estimator.robust: not converged after {robust.summary.passes} passes. Raise its passes."
         warn_about_file(message, NumericalWarning)
     return robust.fit, robust.summary

@@ -75,10 +75,10 @@ _IMU = ("imu_specific_force", "imu_angular_velocity")
 _WIDTH = 80  # of comments that list what has no entry
 _LISTED = 60  # lines of these
 _WHAT = {
-    "columns": "names, units and orders of the file: docs/logs.md",
-    "topics": "what the messages of the bag hold: docs/logs.md",
+    "columns": "names, units and order of the columns: docs/logs.md",
+    "topics": "content of the topics: docs/logs.md",
 }
-_WELDED = "joints that the log lacks, held still; one that moves needs readings"
+_WELDED = "joints without readings are held still; add readings of joints that move"
 
 
 @dataclass
@@ -103,13 +103,13 @@ class InitReport:
     def lines(self) -> list[tuple[str, str]]:
         """A word for what each text is, and the text."""
         said = [(word, text) for word in ("found", "assumed", "missing") for text in getattr(self, word)]
-        then = f"next: fill in {FILL_IN} there" if self.is_open else f"next: torchid check {self.output}"
+        then = f"next: replace {FILL_IN} there" if self.is_open else f"next: torchid check {self.output}"
         return [*said, ("written to", f"{self.output}; {then}")]
 
 
 _NO_CONTACT = (
-    "contacts: no link is called a foot, so that nothing but gravity acts on the base; name the frames that touch the"
-    " ground, or that rotors push at (docs/contacts.md), or robot.fixed_base: true if the base stands still"
+    "contacts: no link is named foot. List the frames that touch the ground (or of rotors: docs/contacts.md), or set"
+    " robot.fixed_base: true if the base stands still"
 )
 
 
@@ -129,7 +129,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path, total_mass: floa
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise ConfigError("command line", "--output", f"'{target}'", "a file name that ends in .yaml or .yml")
     if os.path.lexists(target):
-        raise ConfigError(target, "--output", "exists", "a new file: torchid init replaces none")
+        raise ConfigError(target, "--output", "exists", "a new file; torchid init overwrites no file")
     path, of_folder = log_in_folder(Path(log))
     part = split_range(path)
     files = [file.path for file in part.files]
@@ -160,9 +160,9 @@ def init(urdf: str | Path, log: str | Path, output: str | Path, total_mass: floa
     _describe(out, robot, contacts, fields, proposal)
     _describe_log(out, read, fields)
     out.assumed += of_folder
-    out.assumed += [f"preprocessing.{key}: {value}, {why}" for key, (value, why) in gaps.items()]
+    out.assumed += [f"preprocessing.{key}: {value} ({why})" for key, (value, why) in gaps.items()]
     out.assumed += [split.assumed] * bool(split.assumed)
-    out.assumed += ["sensors.joint_torques: those that the log has, not of all joints"] * bool(torques)
+    out.assumed += ["sensors.joint_torques: only the joints with torques in the log"] * bool(torques)
     out.missing += [split.missing] * bool(split.missing)
     with atomic_output(target) as new:
         new.write_text(text, encoding="utf-8")
@@ -177,8 +177,8 @@ def _explains(experiment: str) -> bool:
 
 
 _HELD = (
-    "robot.fixed_base: true, as torques are those of legs on a held base, not of feet that carry the robot; "
-    "if it stands, name its feet under contacts instead"
+    "robot.fixed_base: true, as the torques do not carry the robot's weight. If it stands on its feet, list them under "
+    "contacts instead"
 )
 
 
@@ -190,7 +190,7 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[GuessedContac
     for file in files:
         size = memory_needed(file, PreprocessingConfig().memory_gb, size)
         if size > PreprocessingConfig().memory_gb:
-            accepted = "a log of a part of the recording, whose map holds for all of it"
+            accepted = "a log of a part of the recording; its map is valid for all of it"
             raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
         with about_file(file):
             samples.append(read_sample(file))
@@ -265,7 +265,7 @@ def _state_flags(robot: Robot, contacts: Sequence[GuessedContact], fields: set[s
         always = [contact.frame for contact in contacts]
         is_map = proposal.key == "columns"
         proposal.columns["contact_active"] = {"always": always} if is_map else dict.fromkeys(always, True)
-        proposal.assumed["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
+        proposal.assumed["contact_active"] = "all feet always touch the ground, as the log does not say otherwise"
 
 
 def _describe(
@@ -274,27 +274,27 @@ def _describe(
     """What was found, assumed and missed, in lines."""
     _describe_map(out, robot, contacts, fields, proposal)
     if contacts:
-        balls = "; radius 0, as no orientation says where the ground is that balls roll on"
+        balls = "; radius 0 (no rolling), as the log has no orientation"
         out.assumed.append(
-            "contacts: from names or balls of links; point where there is a ball or more than two"
+            "contacts: from names and balls of links; type point for balls, or for more than two contacts"
             + balls * any(contact.radius == 0.0 for contact in contacts)
         )
     settings = [ContactConfig(x.frame, x.type, radius=AUTO if x.radius is None else x.radius) for x in contacts]
     rolling = resolve_contacts(settings, robot)[1]
     out.assumed += [f"contacts: {rolling}"] * bool(rolling)
     if _is_fixed(contacts, fields) and not robot.fixed_base and _HELD not in out.assumed:
-        out.assumed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
+        out.assumed.append("robot.fixed_base: true, as no foot and no base motion was found")
     if held := held_joints(robot, proposal.lacking):
         out.assumed.append(f"robot.weld: {_WELDED}: {join_names(held)}")
     if not contacts and not robot.fixed_base and not _is_fixed(contacts, fields):
         out.missing.append(_NO_CONTACT)
     from_feet = _from_feet(robot, contacts, fields)
     if contacts and "contact_active" not in fields:
-        instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"
-        out.missing.append(f"contact_active: which foot touches when; {instead}")
+        instead = "detected from joint torques" if "detect_contacts" in from_feet else "all feet always touch"
+        out.missing.append(f"contact_active (which foot touches when): {instead}")
     if _lacks_base_motion(robot, contacts, fields):
-        instead = "; taken from the feet that stand" if "base_motion" in from_feet else ""
-        lacks = "its orientation alone, no position or IMU" if set(_POSE) & fields else "neither its pose nor an IMU"
+        instead = "; computed from the standing feet" if "base_motion" in from_feet else ""
+        lacks = "only its orientation, no position and no IMU" if set(_POSE) & fields else "no pose and no IMU"
         out.missing.append(f"motion of the base: {lacks}{instead}")
 
 
@@ -308,16 +308,16 @@ def _describe_map(
     if known := [x for x, entry in proposal.columns.items() if not x.endswith(no_fields) and FILL_IN not in str(entry)]:
         out.found.append(f"{proposal.key} of {', '.join(known)}")
     open_keys = [key for key, entry in proposal.columns.items() if FILL_IN in str(entry)]
-    out.missing += [f"{key}: to be filled in, {proposal.assumed.get(key, FILL_IN)}" for key in open_keys]
+    out.missing += [f"{key}: fill in {proposal.assumed.get(key, FILL_IN)}" for key in open_keys]
     out.assumed += [f"{key}: {note}" for key, note in proposal.assumed.items() if key not in open_keys]
     if "ignore" in proposal.columns or (proposal.key == "topics" and proposal.listed):
-        what = f"{proposal.key} without an entry are listed in the file: {join_names(proposal.listed)}"
+        what = f"unused {proposal.key}, listed in the file: {join_names(proposal.listed)}"
         out.assumed.append(what)
     if proposal.perhaps:
         keys = join_names(list(dict.fromkeys(key for key, _, _ in proposal.perhaps)))
-        out.missing.append(f"{keys}: not sure, as comments in the file; take out the mark of what is right")
+        out.missing.append(f"{keys}: uncertain, given as comments in the file; uncomment what is right")
     if not set(_FORCES) & fields and "joint_torque" not in open_keys:
-        out.missing.append("forces: neither joint torques nor contact wrenches")
+        out.missing.append("forces: no joint torques and no contact wrenches")
 
 
 def _try(path: Path, proposal: MapProposal) -> list[Log] | InputError:
@@ -334,7 +334,7 @@ def _describe_log(out: InitReport, read: list[Log] | InputError, fields: set[str
     """What there is of the log, by the names of the file's fields, or why it is not read."""
     if isinstance(read, InputError):
         out.missing.append(
-            f"the log is not read with this file yet: {read.field}: {read.found}; accepted: {read.accepted}"
+            f"the log cannot be read with this file yet: {read.field}: {read.found}; accepted: {read.accepted}"
         )
         return
     if not read:
@@ -368,8 +368,8 @@ def _text(
     robot_keys |= {"fixed_base": True} if robot.fixed_base or _is_fixed(contacts, fields) else {}
     robot_keys |= {"weld": weld} if (weld := welded_at(robot, held_joints(robot, proposal.lacking))) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
-    to_fill_in = f", fill in {FILL_IN}" * (FILL_IN in str(proposal.columns))
-    lines = [f"# {names}, by torchid init; check what is assumed{to_fill_in}"]
+    to_fill_in = f" and replace {FILL_IN}" * (FILL_IN in str(proposal.columns))
+    lines = [f'# {names}, by torchid init; check lines marked "assumed"{to_fill_in}']
     lines += yaml_lines("robot", robot_keys)
     lines += [f"  # assumed: weld: {_WELDED}"] * bool(weld)
     if contacts:
@@ -393,7 +393,7 @@ def _text(
     margin = {"contact_margin_s": "auto"} if contacts and "contact_active" in fields else {}
     lines += yaml_lines("preprocessing", {"cutoff_hz": "auto"} | margin | from_feet | stated)
     lines += yaml_lines("sensors", sensors)
-    lines += ["# actuators: chosen by the log (armature, delay, offsets, ...); true, false or a number fixes one"]
+    lines += ["# actuators: armature, delay, offsets, ... are chosen by the log; fix one with true, false or a number"]
     lines += yaml_lines("estimator", {"name": "consistent", "ridge": "auto", **known})
     lines += yaml_lines("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"
@@ -403,13 +403,13 @@ def _comments(proposal: MapProposal) -> list[str]:
     """Entries that are not sure, and what has no entry, as comments."""
     out = []
     for key, entry, why in proposal.perhaps:
-        instead = f", in place of {FILL_IN}" * (key in proposal.columns)
+        instead = f" instead of {FILL_IN}" * (key in proposal.columns)
         out += wrap(f"perhaps{instead}, {why}:", _WIDTH, initial_indent="    # ", subsequent_indent="    # ")
         out += [f"    # {line}" for line in yaml_lines(key, entry)]
     if proposal.listed:
         what = "columns" if proposal.key == "columns" else "topics"
-        where = ", which ignore leaves out" * ("ignore" in proposal.columns)
-        out.append(f"    # {what} without an entry{where}:")
+        where = " (left out by ignore)" * ("ignore" in proposal.columns)
+        out.append(f"    # unused {what}{where}:")
     for text in proposal.listed[:_LISTED]:
         out += wrap(text, _WIDTH, initial_indent="    #   ", subsequent_indent="    #     ", break_on_hyphens=False)
     more = len(proposal.listed) - _LISTED

@@ -220,19 +220,19 @@ def log_in_folder(path: Path) -> tuple[Path, list[str]]:
         return path, []
     files = sorted(file for file in path.iterdir() if file.suffix.lower() in (*TABLES, *ARRAYS) and file.is_file())
     if len(files) > _FILES:
-        raise LogError(path, "file", f"a folder of {len(files)} logs", f"at most {_FILES}, the files of one log")
+        raise LogError(path, "file", f"a folder of {len(files)} logs", f"a folder of at most {_FILES} files of one log")
     if (single := sorted(path.glob("*.npy"))) and not files:
-        reason = f"{len(single)} arrays in files of their own, {join_names([file.name for file in single])}"
-        raise LogError(path, "file", reason, f"one file of all: {_AS_ONE.format(path.name)}")
+        reason = f"{len(single)} arrays in separate files: {join_names([file.name for file in single])}"
+        raise LogError(path, "file", reason, f"one file with all of them: {_AS_ONE.format(path.name)}")
     steps = {file: step for file in files if (step := _step_of(file)) is not None}
     if not steps:
-        accepted = "a folder of tables or arrays that have stamps, or one recorded by ROS 2; or name the files of a log"
-        reason = f"a folder, {format_count(len(files), 'log')} without stamps and fields"
+        accepted = "a folder of tables or arrays with stamps, a ROS 2 bag, or the names of the files of a log"
+        reason = f"a folder with {format_count(len(files), 'log')} without stamps or known fields"
         raise LogError(path, "file", reason, accepted)
     used = sorted(steps, key=lambda file: steps[file])
     others = [file.name for file in files if file not in steps]
-    note = f"logs: {format_count(len(used), 'file')} of the folder as one log, the fastest first"
-    note += f"; without {join_names(others)}, which have no stamps or no field" * bool(others)
+    note = f"logs: {format_count(len(used), 'file')} of the folder are one log; the fastest comes first"
+    note += f"; {join_names(others)} left out (no stamps or no known field)" * bool(others)
     return path / JOINED.join(file.name for file in used), [note]
 
 
@@ -290,15 +290,15 @@ def split_logs(logs: Sequence[Log], base_is_derived: bool = False) -> Split:
         return Split()
     lengths = [float(log.time[-1] - log.time[0]) for log in logs]
     spoiled = 0.0 if cutoff_hz is None else 2.0 * DROPPED_PERIODS / cutoff_hz
-    filtered = "" if cutoff_hz is None else f" (the filter of {cutoff_hz:g} Hz spoils {spoiled:.2g} s)"
+    filtered = "" if cutoff_hz is None else f" (the {cutoff_hz:g} Hz filter needs {spoiled:.2g} s)"
     if len(logs) > 1:
         return _split_recordings(lengths, spoiled, filtered)
     (length,) = lengths
     if _TESTED * length >= _LEAST_TEST * spoiled:
         return Split()
     if length <= spoiled:
-        return Split(("",), (), missing=f"motion: {length:.2g} s are too short for a fit{filtered}")
-    assumed = f"logs.test: none, as {length:.2g} s are too short for a part to be held back{filtered}"
+        return Split(("",), (), missing=f"motion: {length:.2g} s is too short for a fit{filtered}")
+    assumed = f"logs.test: none, as {length:.2g} s is too short for a test part{filtered}"
     return Split(("",), (), assumed)
 
 
@@ -308,16 +308,16 @@ def _split_recordings(lengths: Sequence[float], spoiled: float, filtered: str) -
     Those of which a filter leaves next to nothing are left out.
     """
     long = [number for number, length in enumerate(lengths) if length >= _LEAST_TEST * spoiled]
-    assumed = f"logs: {len(lengths)} recordings one after the other, as stamps begin anew"
+    assumed = f"logs: {len(lengths)} recordings in a row, as stamps start again"
     if len(long) < len(lengths):
         assumed += f"; {len(lengths) - len(long)} of them left out as too short{filtered}"
     if not long:
-        text = f"motion: {len(lengths)} recordings of {max(lengths):.2g} s at most are too short for a fit{filtered}"
+        text = f"motion: {len(lengths)} recordings of at most {max(lengths):.2g} s are too short for a fit{filtered}"
         return Split(_numbered(list(range(len(lengths)))), (), missing=text)
     held = max(1, round(_TESTED * len(long))) if len(long) > 1 else 0
     train = long[: len(long) - held]
     test = long[len(long) - held :]
-    assumed += f"; the last {held} held back as test" * (held > 1) + "; the last held back as test" * (held == 1)
+    assumed += f"; the last {held} are the test logs" * (held > 1) + "; the last is the test log" * (held == 1)
     return Split(_numbered(train), _numbered(test), assumed)
 
 
@@ -361,11 +361,9 @@ def keys_for_gaps(logs: Sequence[Log]) -> dict[str, tuple[object, str]]:
     name = next((x for *_, x in gaps if x), "")
     out: dict[str, tuple[object, str]] = {}
     if 0.0 < longest <= _BRIDGED_S:
-        out["bridge_gaps_s"] = (_BRIDGED_S, f"as gaps of {name} take up to {longest:.2g} s")
+        out["bridge_gaps_s"] = (_BRIDGED_S, f"{name} has gaps of up to {longest:.2g} s")
     if longest > _BRIDGED_S or at_end:
-        reason = (
-            f"as gaps of {name} take up to {longest:.2g} s" if longest > _BRIDGED_S else f"as {name} has one at an end"
-        )
+        reason = f"{name} has gaps of up to {longest:.2g} s" if longest > _BRIDGED_S else f"{name} has a gap at one end"
         out["exclude_rejected"] = (True, reason)
     return out
 
@@ -375,4 +373,4 @@ def keys_for_length(logs: Sequence[Log]) -> dict[str, tuple[object, str]]:
     samples = sum(map(len, logs))
     if samples <= _MANY:
         return {}
-    return {"sample_rate_hz": ("auto", f"as {samples} samples are many: five for each period of the cutoff are kept")}
+    return {"sample_rate_hz": ("auto", f"of {samples} samples, five for each period of the cutoff are kept")}

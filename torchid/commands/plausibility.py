@@ -55,9 +55,8 @@ _PART = 0.05  # share of a log's samples from which on a finding may be the reas
 #: Findings that say how a signal was recorded, which need not be why forces are not explained, or that they are not.
 _NO_REASONS = ("dead band", "forces", "frozen", "gap", "held", "saturated", "spike", "step")
 _USUAL = (
-    "torques or wrenches of the opposite sign, a world whose z axis points down, flags of other contacts, a quaternion "
-    "in another order, another unit, rotors or a delay that actuators leave out, masses in the {of} that are none, or "
-    "noise (sensors.noise)"
+    "wrong signs, units, contact flags or quaternion order, a world z axis that points down, wrong masses in the {of}, "
+    "rotors or a delay that actuators exclude, or noise (sensors.noise)"
 )
 
 
@@ -94,7 +93,7 @@ class TrainingLogs:
                 form = self.setup.robot.format
                 lower = lower_cutoff(self.setup)
                 band = "" if lower is None else f"preprocessing.cutoff_hz={lower}; or "
-                accepted = f"{band}data and {form} that fit each other; usual reasons: {_USUAL.format(of=form)}"
+                accepted = f"{band}data and {form} that match; usual reasons: {_USUAL.format(of=form)}"
                 raise ImplausibleFitError.at_field("logs", reason, _advice(accepted, self.setup))
             return ""
         log, finding = self.finding
@@ -156,9 +155,9 @@ def require_plausible(
     estimate = fit.estimate
     setup = logs.setup
     if not estimate.rank:
-        raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
+        raise SensorError.at_field("sensors", "they determine no parameter", "other sensors, contacts or logs")
     if not max(fit.assembly.problem.cost(np.zeros_like(estimate.phi)), fit.assembly.forces) > 0.0:
-        raise ImplausibleFitError.at_field("logs", "all measured forces are 0", "forces; NaN where none was measured")
+        raise ImplausibleFitError.at_field("logs", "all measured forces are 0", "measured forces; NaN: not measured")
     block_error = 0.0 if fit.jackknife is None else fit.jackknife.mass_error
     tolerance = setup.config.estimator.rank_tolerance
     by_data = LeastSquares(rank_tolerance=tolerance).solve(fit.assembly.problem)
@@ -168,7 +167,7 @@ def require_plausible(
     mass, mass_by_data = (total_mass(fit.assembly, x, tolerance, block_error, gain_error) for x in (estimate, by_data))
     reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass_by_data, setup.robot)
     if _is_held(setup, force_gain(fit.assembly.if_known)):
-        refusal = "torques are those of limbs on a held base, not of feet that carry the robot"
+        refusal = "the torques do not carry the robot's weight: is its base held?"
         accepted = "robot.fixed_base: true, without contacts and preprocessing.base_motion"
         raise ImplausibleFitError.at_field("preprocessing.base_motion", refusal, accepted)
     beyond = ""
@@ -178,7 +177,7 @@ def require_plausible(
     if reason:
         logs.doubt(reason, refused=True)
     if beyond:
-        advice = "; check units, frames, quaternion order and contact_active, or state the noise that there is"
+        advice = ". Check units, frames, quaternion order and contact_active, or state a larger noise."
         warn_about_file(f"{beyond}{logs.doubt(beyond, refused=False) or advice}", NumericalWarning)
     else:
         _warn_of_tilt(samples, setup)
@@ -189,7 +188,7 @@ def _advice(text: str, setup: RobotSetup) -> str:
     """What to do, first of all where nothing holds the robot: then masses of 0 explain forces of no weight."""
     if setup.contacts or setup.robot.fixed_base or "under contacts" in text:
         return text
-    return f"name under contacts what touches the ground, or robot.fixed_base: true if the base stands still; or {text}"
+    return f"contacts with the ground, or robot.fixed_base: true if the base stands still; or {text}"
 
 
 def _is_held(setup: RobotSetup, gain: float | None) -> bool:
@@ -222,11 +221,11 @@ def _require_scales(by_data: Sequence[ExtraEstimate], has_contacts: bool) -> Non
     scales = {x.extra.label: 1.0 + x.value for x in by_data if x.extra.what == "scale"}
     beyond = [f"{label} {x:.2g}" for label, x in scales.items() if is_implausible_factor(x)]
     if beyond:
-        refusal = f"of all measured forces, which no mass determines here: {join_names(beyond)}"
-        accepted = "a sensor without a scale, or estimator.masses of bodies whose weight acts on it"
+        refusal = f"the data do not determine scales of all measured forces: {join_names(beyond)}"
+        accepted = "a sensor without a scale, or known estimator.masses that load it"
         if has_contacts:
-            reason = "mass at a contact that always stands acts on no joint"
-            accepted = f"a sensor without a scale, or logs in which each contact lifts: {reason}"
+            reason = "else mass at a standing contact loads no joint"
+            accepted = f"a sensor without a scale, or logs in which each contact lifts off: {reason}"
         raise ImplausibleFitError.at_field("sensors.scales", refusal, accepted)
 
 
@@ -248,7 +247,7 @@ def require_not_worse(worse: list[WorseThanNominal], fitted: Metrics, sensors: S
     if unexplained := unexplained_torques(fitted, sensors):
         logs.doubt(unexplained, refused=True)
     if message := describe_worse(worse, logs.setup.robot.format):
-        warn_about_file(f"{message}{logs.doubt(message, refused=False) or f'; {ADVICE}'}", NumericalWarning)
+        warn_about_file(f"{message}{logs.doubt(message, refused=False) or f'. {ADVICE}'}", NumericalWarning)
 
 
 def suspected_mistake(run: Results, logs: TrainingLogs) -> str:
@@ -293,10 +292,10 @@ def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: R
     """
     gain = force_gain(problem)
     if mass.determined and is_implausible_factor(mass.value / mass.nominal):
-        known = f"{mass.value:.4g} ± {mass.standard_error:.2g} kg where the {robot.format} weighs {mass.nominal:.4g} kg"
-        return f"the fit's total mass is {known}{_sign_note(mass.value / mass.nominal)}"
+        known = f"{mass.value:.4g} ± {mass.standard_error:.2g} kg ({robot.format}: {mass.nominal:.4g} kg)"
+        return f"the fitted total mass is {known}{_sign_note(mass.value / mass.nominal)}"
     if gain is not None and is_implausible_factor(gain):
-        return f"the measured forces are {gain:.3g} times what the {robot.format}'s bodies need{_sign_note(gain)}"
+        return f"the measured forces are {gain:.3g} times those that the {robot.format} needs{_sign_note(gain)}"
     return next(_beyond_bounds(phi.reshape(-1, PER_BODY), robot), None)
 
 
@@ -320,7 +319,7 @@ def _beyond_bounds(phi: Array, robot: Robot) -> Iterator[str]:
     beyond = ~(np.abs(phi) <= LARGEST_FACTOR * np.maximum(bound, np.abs(robot.nominal)))
     for body, parameter in np.argwhere(beyond):
         fitted = f"{robot.body_names[body]} has {PARAMETERS[parameter]} = {phi[body, parameter]:.3g}"
-        yield f"the fit's {fitted}, beyond {LARGEST_FACTOR:g} times the whole {robot.format}'s {bound[parameter]:.3g}"
+        yield f"the fit's {fitted}, over {LARGEST_FACTOR:g} times the whole {robot.format}'s {bound[parameter]:.3g}"
 
 
 def _reach(robot: Robot) -> float:

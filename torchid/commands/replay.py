@@ -76,8 +76,8 @@ class Replay:
     __repr__ = short_repr
 
     def _headline(self) -> str:
-        texts = [f"{name} {before:.3g} and {after:.3g}" for name, (before, after) in self.at(self.window).items()]
-        return f"{self.source}, drift after {self.window:g} s, {self.of} against identified: {'; '.join(texts)}"
+        texts = [f"{name} {before:.3g} -> {after:.3g}" for name, (before, after) in self.at(self.window).items()]
+        return f"{self.source}, drift after {self.window:g} s, {self.of} -> identified: {'; '.join(texts)}"
 
     @property
     def driven(self) -> str:
@@ -207,7 +207,7 @@ def replay(
 
 def _require_accepted(window: float, samples: int) -> None:
     if not 0.0 < window < np.inf:
-        raise ConfigError("command line", "--window", f"{window:g}", "a length of time greater than 0 [s]")
+        raise ConfigError("command line", "--window", f"{window:g}", "a time greater than 0 [s]")
     if not 0 <= samples <= _MOST_SAMPLES:
         raise ConfigError("command line", "--samples", f"{samples}", f"0 to {_MOST_SAMPLES}")
 
@@ -267,7 +267,7 @@ def _drawn(fitted: FittedRun, run: Path, count: int) -> Iterator[Model]:
             yield _model(file, robot, joints, phi, stribeck)
 
 
-_GAIN = "a number of at least 0, or numbers by joint or pattern: 20 '*_calf=30'"
+_GAIN = "numbers of at least 0, one for all joints or by pattern: 20 '*_calf=30'"
 
 
 def parse_gains(option: str, entries: Sequence[str]) -> dict[str, float]:
@@ -373,7 +373,7 @@ def _replayed(samples: Samples) -> ReplayedLog:
     """
     base = samples.base
     if samples.torque is None or not np.isfinite(samples.torque.numpy()).all():
-        raise LogError(samples.source, "joint_torque", "not of every joint", "a log with the torques of all joints")
+        raise LogError(samples.source, "joint_torque", "missing for some joints", "a log with all joint torques")
     floating = base.angular_velocity is not None
     if floating and base.quat_xyzw is None:
         raise LogError(samples.source, "base", "no orientation", "base_quat_wxyz or base_quat_xyzw, to replay it")
@@ -403,7 +403,7 @@ def _feet(contacts: Sequence[Contact], urdf: Path) -> tuple[Foot, ...]:
         try:
             feet += find_feet([FootConfig(frame=contact.frame)], urdf)
         except ConfigError as error:
-            reason = f"{contact.frame}: {contact.kind}, and {urdf.name} has no collision spheres at it"
-            accepted = f"collision spheres of the link {contact.frame}, or point contacts: a replay stands on these"
+            reason = f"{contact.frame} is a {contact.kind} contact, but {urdf.name} has no collision spheres there"
+            accepted = f"point contacts, or collision spheres of the link {contact.frame}"
             raise ConfigError.at_field("contacts", reason, accepted) from error
     return tuple(feet)

@@ -68,7 +68,7 @@ PAGE = "report.html"
 DATA = "report.json"
 _JSON = ("parameters.json", "metrics.json", DATA)
 
-_WRITTEN = "a folder that this version of torchid identify wrote"
+_WRITTEN = "a folder written by this version of torchid identify"
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -426,7 +426,7 @@ def write_page(folder: Path, output: Path) -> None:
         folder: with its files.
         output: that the folder will be.
     """
-    asked = f"torchid report {output} checks the logs and lists here what it finds."
+    asked = f"To list the findings of the log checks here, run torchid report {output}."
     (folder / PAGE).write_text(page_text(replace(_read(folder), name=output.name, not_checked=asked)))
 
 
@@ -440,12 +440,12 @@ def report(run: str | Path) -> Path:
     refuse_link(folder)
     manifest = read_manifest(folder)
     if manifest is None or manifest.kind != RUN.name:
-        raise ConfigError(folder, "RUN", "no run of torchid", _WRITTEN)
+        raise ConfigError(folder, "RUN", "not a run of torchid", _WRITTEN)
     page = folder / PAGE
     written = manifest.files.get(PAGE)
     there = page.exists() or page.is_symlink()
     if there and (page.is_symlink() or not page.is_file() or written is None or file_checksum(page) != written):
-        raise ConfigError(folder, PAGE, "changed since torchid wrote it", f"a run without {PAGE}: move it elsewhere")
+        raise ConfigError(folder, PAGE, "changed since torchid wrote it", f"a run without your {PAGE}; move it first")
     files = _with_findings(_read(folder), folder)
     with during("writing", folder), atomic_file(page) as new:
         new.write_text(_made(files, folder))
@@ -458,7 +458,7 @@ def _made(files: RunFiles, folder: Path) -> str:
     try:
         return page_text(files)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        reason = f"not what a page needs ({excerpt(str(error))})"
+        reason = f"not usable for the page ({excerpt(str(error))})"
         raise InputError(folder, ", ".join(_JSON), reason, _WRITTEN) from error
 
 

@@ -126,7 +126,7 @@ def _form(form: str | None, out: Path | None) -> str:
         raise ConfigError("command line", "--format", f"'{form}'", ", ".join(SAMPLE_FORMATS))
     by_suffix = None if out is None else _BY_SUFFIX.get(out.suffix.lower())
     if out is not None and form is None and by_suffix is None:
-        reason = f"'{out.name}', whose extension says no format"
+        reason = f"'{out.name}' has no known extension"
         raise ConfigError("command line", "--output", reason, f"FILE.npz, FILE.json, or --format {' or '.join(ROBOTS)}")
     if form == "npz" and out is not None and by_suffix != "npz":
         raise ConfigError("command line", "--output", f"'{out.name}'", "FILE.npz, with --format npz")

@@ -81,7 +81,7 @@ def require_trainable(config: ExperimentConfig, resume: bool) -> None:
     if config.estimator.name != "sgd" or output is None:
         if resume:
             sgd = config.estimator.name == "sgd"
-            reason = "set, without an output" if sgd else f"{config.estimator.name}, which is done in one go"
+            reason = "needs an output" if sgd else f"{config.estimator.name} has nothing to resume"
             accepted = "an output with an unfinished run" if sgd else "estimator.name: sgd, or no --resume"
             raise ConfigError.at_field("--resume", reason, accepted)
         return
@@ -92,7 +92,7 @@ def require_trainable(config: ExperimentConfig, resume: bool) -> None:
     if resume and not waiting:
         if output.exists() and not config.overwrite:
             raise ConfigError(output, "--resume", "a finished run", "an unfinished one, or overwrite=true")
-        message = f"{folder}: no checkpoint to go on from; training starts at the beginning"
+        message = f"{folder}: no checkpoint found. Training starts from the beginning."
         warn(message)
     elif waiting and not resume and not config.overwrite:
         raise ConfigError(folder, "output", "an unfinished training", "--resume, overwrite=true, or another output")
@@ -155,7 +155,7 @@ class Training:
             held_out = MiniBatches(logs["validation"], builder, size, seed, share=share, assembly=held_out_rows)
         trainer = Trainer(self.settings, problem, train, held_out, data=sampled.problem)
         if not trainer.closed_form.rank:
-            raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors or contacts")
+            raise SensorError.at_field("sensors", "they determine no parameter", "other sensors or contacts")
         state = distributed.from_first(partial(self._prepare, trainer, resume), "checkpoint")
         if state is not None:
             if not distributed.is_first():
@@ -193,7 +193,7 @@ class Training:
         if contents := inspect_folder(self.folder, TRAINING):
             contents.remove()
         if self.folder.exists():
-            message = f"{self.folder}: stays: it holds what torchid did not write"
+            message = f"{self.folder}: not removed, as it has files that torchid did not write."
             warn(message)
 
     def _curves(self, since: int) -> AbstractContextManager[RunEvents | None]:
@@ -259,7 +259,7 @@ class Training:
 
     def _check(self, state: Mapping[str, Any], trainer: Trainer, path: Path) -> None:
         if set(state) != {"config", "logs", "trainer"}:
-            raise InputError(path, "file", "not a checkpoint of a run", "one that torchid identify wrote")
+            raise InputError(path, "file", "not a checkpoint of a run", "a checkpoint written by torchid identify")
         check_yaml(state["config"])
         before, now = (yaml.safe_load(text) for text in (state["config"], self._text))
         for key, old, new in _differences(before, now):
@@ -267,7 +267,7 @@ class Training:
                 raise ConfigError.at_field(key, f"{new}, but the checkpoint has {old}", "the same settings")
         rows, cost = _fingerprint(trainer)
         if state["logs"][0] != rows or abs(state["logs"][1] - cost) > _SAME * cost:
-            raise ConfigError.at_field("logs", "not those of the checkpoint", "the same files, unchanged")
+            raise ConfigError.at_field("logs", "differ from those of the checkpoint", "the same files, unchanged")
 
     @contextmanager
     def _interruptible(self, trainer: Trainer) -> Iterator[None]:
@@ -276,7 +276,7 @@ class Training:
         except KeyboardInterrupt as error:
             stopped = f"interrupted in epoch {trainer.epoch}"
             if self.folder is not None:
-                stopped = f"{stopped}; --resume goes on after epoch {self._saved}"
+                stopped = f"{stopped}. Use --resume to continue after epoch {self._saved}."
             raise KeyboardInterrupt(stopped) from error
         except InputError:  # it would diverge again; the curves stay, to be looked at
             if distributed.is_first() and self.folder is not None:
@@ -284,7 +284,7 @@ class Training:
             raise
 
 
-_CHECKPOINT_ACCEPTED = "a checkpoint that torchid wrote"
+_CHECKPOINT_ACCEPTED = "a checkpoint written by torchid"
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
@@ -323,10 +323,10 @@ def load_checkpoint(folder: Path) -> dict[str, Any]:
         whole = path.read_bytes()
         content = whole[_DIGEST_BYTES:]
         if hashlib.sha256(content).digest() != whole[:_DIGEST_BYTES]:
-            raise ValueError("not what was written, by its checksum")
+            raise ValueError("its checksum is wrong")
         state = torch.load(io.BytesIO(content), weights_only=True)
     if not isinstance(state, dict):
-        raise InputError(path, "file", f"holds a {type(state).__name__}", _CHECKPOINT_ACCEPTED)
+        raise InputError(path, "file", f"contains a {type(state).__name__}", _CHECKPOINT_ACCEPTED)
     return state
 
 

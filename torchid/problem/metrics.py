@@ -368,11 +368,11 @@ ROW_GROUPS = {
     "joint_torque": "joint torque [N m]",
     "base_force": "base force [N]",
     "base_moment": "base moment [N m]",
-    "nullspace": "projected [N, N m]",
+    "nullspace": "projected force [N, N m]",
 }
 """Groups of rows with errors, with a name and unit to show."""
 
-ERROR_GROUPS = ROW_GROUPS | {WHITENED: "whitened [x noise]"}
+ERROR_GROUPS = ROW_GROUPS | {WHITENED: "residual [x noise]"}
 """The same, and the whitened projected residual of a fit's rows, which every sensor set has."""
 
 IN_AIR = "limbs in the air"  # only their joint torques count if no contact force was measured
@@ -398,8 +398,8 @@ DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", *LIMB_GROUPS, WH
 """Groups of rows that decide whether parameters are better than the nominal ones."""
 
 ADVICE = (
-    "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge than in "
-    "its config.yaml, or record more varied motion"
+    "Do not use these parameters. Run torchid check on the same file, raise estimator.ridge above that of config.yaml, "
+    "or record more varied motion."
 )
 """Advice for parameters that predict worse than the nominal ones."""
 
@@ -744,7 +744,7 @@ class WorseThanNominal:
     identified: float
 
     def __str__(self) -> str:
-        return describe_errors(self.group, self.identified, self.nominal) or self.group
+        return _describe_error(self.group, self.nominal, self.identified)
 
 
 def describe_worse(groups: list[WorseThanNominal], nominal_label: str) -> str | None:
@@ -753,16 +753,18 @@ def describe_worse(groups: list[WorseThanNominal], nominal_label: str) -> str | 
         return None
     by_logs = {group.logs: [str(other) for other in groups if other.logs == group.logs] for group in groups}
     texts_by_logs = "; ".join(f"on {logs}: {join_names(texts)}" for logs, texts in by_logs.items())
-    return f"the identified parameters predict worse than the {nominal_label}, {texts_by_logs}"
+    return f"WORSE THAN {nominal_label} ({nominal_label} -> identified) {texts_by_logs}"
 
 
-def describe_errors(group: str, identified: float | None, nominal: float | None) -> str | None:
-    """Both errors of a group of rows as text, None if one is unknown."""
-    if identified is None or nominal is None:
-        return None
+def describe_errors(nominal: Metrics, identified: Metrics) -> str:
+    """Nominal -> identified errors of all decisive groups that both have."""
+    pairs = [(group, nominal.rms_of(group), identified.rms_of(group)) for group in DECISIVE_GROUPS]
+    return "; ".join(_describe_error(x, a, b) for x, a, b in pairs if a is not None and b is not None)
+
+
+def _describe_error(group: str, nominal: float, identified: float) -> str:
     unit = _LABELS[group].split("[")[1].rstrip("]")
-    name = "whitened projected residual" if group == WHITENED else group_name(group)
-    return f"{name} {identified:.3g} against {nominal:.3g} {unit}"
+    return f"{group_name(group)} {nominal:.3g} -> {identified:.3g} {unit}"
 
 
 def group_name(group: str) -> str:

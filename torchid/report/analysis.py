@@ -113,12 +113,12 @@ def base_parameters_document(base: BaseParameters, body_names: Sequence[str]) ->
 
 def base_parameters_text(title: str, base: BaseParameters, body_names: Sequence[str]) -> str:
     """Base parameters as text of 100 columns."""
-    count = f"{base.rank} combinations of {int(base.free.sum())} parameters can be determined, SI units:"
+    count = f"{base.rank} base parameters (combinations of {int(base.free.sum())} parameters) in SI units:"
     lines = [title, "=" * len(title), "", count, ""]
     for formula in format_base_parameters(base, body_names):
         lines += wrap(formula, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
     unobservable = unobservable_parameters(base, body_names)
-    lines += ["", "In no combination, whatever the motion:", "", *(unobservable or ["none"])]
+    lines += ["", "Unobservable with any motion:", "", *(unobservable or ["none"])]
     return "\n".join(lines) + "\n"
 
 
@@ -137,7 +137,7 @@ def branch_table(plan: SensorPlan) -> Table:
         rows.append((branch.name, ", ".join(branch.contacts) or "free", needed or no_sensors))
     of_base = [group for group in plan.requirements if not group.branches]
     rows += [("(base)", ", ".join(group.contacts), str(group.fewest_readings)) for group in of_base]
-    return make_table("Branches", ("branch", "contacts beyond it", "sensors needed"), rows)
+    return make_table("Branches", ("branch", "contacts", "sensors needed"), rows)
 
 
 def sets_table(parts: Sequence[PartPlan]) -> Table:
@@ -172,13 +172,13 @@ def observability_table(title: str, states: Sequence[BaseObservability]) -> Tabl
 
 
 def resting_message(share: float) -> str:
-    """What the logs lack of what ranks of the base count on: a share of the torques, of joints at rest."""
-    what = f"{format_percent(share)} % of the logs' torques count as unmeasured at rest (actuators.stiction)"
-    return f"{what}; the base is judged as if joints moved, errors are of the rows left"
+    """That some torques, of joints at rest, are left out, which ranks of the base ignore."""
+    what = f"actuators.stiction leaves out {format_percent(share)} % of the torques, as joints rest"
+    return f"{what}. Observability of the base is judged as if all joints moved."
 
 
 def describe_losses(states: Sequence[BaseObservability]) -> list[str]:
-    """Lost directions of the base with remedies, a message for each that differs."""
+    """Unobservable directions of the base with remedies, a message for each different loss."""
     messages = []
     by_loss: dict[tuple[object, ...], list[LostBase]] = {}
     for lost in (state.lost for state in states if state.lost is not None):
@@ -187,39 +187,38 @@ def describe_losses(states: Sequence[BaseObservability]) -> list[str]:
         lost = alike[0]
         count = f"{len(alike)} of {format_count(len(states), 'contact state')}"
         lacking = [
-            f"{' + '.join(frames)} lacks {format_count(number, 'sensor')}" for frames, number in lost.unmet_groups
+            f"{' + '.join(frames)} needs {format_count(number, 'more sensor')}" for frames, number in lost.unmet_groups
         ]
-        remedies = candidate_names(lost.remedies[:_MAX_REMEDIES]) if lost.remedies else "no single candidate"
+        remedies = candidate_names(lost.remedies[:_MAX_REMEDIES]) if lost.remedies else "more than one sensor"
         whole = len(lost.descriptions) == _BASE_DIRECTIONS
         directions = "whole base" if whole else f"base's {' and '.join(lost.descriptions)}"
-        cause = f"{' and '.join(lacking)} in {count}; any of these would help: {remedies}"
-        messages.append(f"{cause}; lost is the {directions}")
+        messages.append(f"{' and '.join(lacking)} in {count}. Add one of: {remedies}. Unobservable: the {directions}")
     return messages
 
 
 def describe_singular_postures(states: Sequence[BaseObservability], beyond_logs: bool = True) -> list[str]:
-    """Postures at which a set that keeps the base loses it, or nearly so.
+    """Postures at which the base is unobservable, or almost, with sensors that determine it elsewhere.
 
-    `beyond_logs`: whether postures count that the logs, if there are any, do not have.
+    `beyond_logs`: whether postures count that are not in the logs.
     """
     messages = []
     kept = [state for state in states if state.lost is None]
     near = [state.recorded.least for state in kept if state.recorded and state.recorded.least < _MIN_SINGULAR_VALUE]
     if near:
-        where = f"at some postures of the logs the base is nearly lost (smallest singular value {min(near):.2g})"
-        messages.append(f"{where}: use others, or more sensors")
+        where = f"At some postures of the logs the base is almost unobservable (singular value {min(near):.2g})"
+        messages.append(f"{where}. Use other postures, or more sensors.")
     kept = [state for state in kept if beyond_logs or state.recorded is None]
     rare = sum(state.generic.low < BASE_RANK_TOLERANCE for state in kept)
     if rare:
         where = f"{rare} of {format_count(len(states), 'contact state')}"
-        messages.append(f"in {where} the base is nearly lost at one random posture in twenty or more")
+        messages.append(f"In {where} the base is almost unobservable at 5 % or more of random postures.")
     singular = [state for state in kept if state.zero.rank < state.generic.rank]
     if singular:
         dependent = dict.fromkeys(names for state in singular for names in state.dependent)
         cause = "; ".join(" = ".join(names) for names in dependent)
         messages.append(
-            "the base is lost where all joints are at zero, and nearly lost close to it: move elsewhere"
-            + (f"; sensors with dependent readings there: {cause}" if cause else "")
+            "The base is unobservable with all joints at zero. Move away from there."
+            + (f" Dependent readings there: {cause}." if cause else "")
         )
     return messages
 
@@ -227,21 +226,21 @@ def describe_singular_postures(states: Sequence[BaseObservability], beyond_logs:
 def removal_table(plan: SensorPlan) -> Table:
     """Ranks without one sensor, of each sample and of the stack of all samples."""
     title = (
-        f"Without one sensor (inertial combinations: {plan.stack_rank} with this set, "
-        f"{plan.stack_full} with every candidate)"
+        f"Without one sensor (inertial base parameters: {plan.stack_rank} with this set, "
+        f"{plan.stack_full} with all candidates)"
     )
     rows = (
         (x.candidate.name, "fixed base" if x.base_rank is None else f"{x.base_rank} of 6", str(x.stack_rank))
         for x in plan.removals
     )
-    return make_table(title, ("without", "rank(S_b V_x) of each sample", "combinations, all samples together"), rows)
+    return make_table(title, ("without", "rank(S_b V_x) of each sample", "base parameters, all samples"), rows)
 
 
 @dataclass(frozen=True)
 class SetAccuracy:
     """Errors of a fit with one sensor set, measured on the test logs, if any.
 
-    `confounded`: what it is that the set does not separate, in words; `advice`: for each, what not to trust and to do.
+    `confounded`: what the set does not separate, in words. `advice`: what not to trust and to do about each.
     """
 
     channels: int
@@ -288,20 +287,20 @@ ALL_OF = "all sensors of kind "
 
 
 def left_out_table(without: Mapping[str, Evidence]) -> Table:
-    """Change of the error of the other sensors' rows on left-out blocks by leaving a sensor out, the best first."""
+    """Change of the error of the other sensors on held-out blocks without each sensor, the best first."""
     rows = (
         (name, str(evidence), "yes" if evidence.certain else "no")
         for name, evidence in sorted(without.items(), key=lambda pair: -pair[1].gain)
     )
-    title = "Each sensor left out: error of the others on left-out blocks"
+    title = "Without one sensor: change of the error of the others on held-out blocks"
     return make_table(title, ("without", "change", "certain"), rows)
 
 
 def contradicting_messages(without: Mapping[str, Evidence]) -> list[str]:
-    """Sensors that make predictions of the others worse, the worst first, then whole kinds of them."""
+    """Sensors that make the predictions of others worse, the worst first, then whole kinds of sensors."""
     worse = sorted(
         (name.startswith(ALL_OF), -evidence.gain, name) for name, evidence in without.items() if evidence.adopted
     )
     smaller = [(name, format_percent(-np.expm1(0.5 * loss))) for _, loss, name in worse]
-    advice = "check gain, axes and offset: torchid check"
-    return [f"without {name} errors of the others are {share} % smaller; {advice}" for name, share in smaller]
+    advice = "Check its gain, axes and offset: torchid check."
+    return [f"Without {name} the error of the other sensors is {share} % smaller. {advice}" for name, share in smaller]

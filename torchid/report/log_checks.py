@@ -102,7 +102,7 @@ def _draw_panel(axes: Axes, checked: Checked) -> None:
     ranges = axes.secondary_yaxis("right")
     ranges.set_yticks(heights, [_range_text(*channel, values) for channel, values in channels.items()], fontsize=7)
     ranges.tick_params(axis="y", length=0)
-    ranges.set_ylabel(f"range that fills a row: {_RANGE[0]:g} % to {_RANGE[1]:g} % of the values")
+    ranges.set_ylabel(f"range of each row: {_RANGE[0]:g} % to {_RANGE[1]:g} % quantile")
     axes.set_title(_title(checked), loc="left", fontsize=9)
 
 
@@ -132,9 +132,9 @@ def finding_table(findings: Sequence[Finding]) -> Table:
     table.add_column("found", overflow="fold", ratio=8)
     table.add_column("what to do", overflow="fold", ratio=5)
     for finding, *others in group_alike(findings):
-        text = f"{finding.field}, {finding.name}: {finding.found}"
+        text = f"{finding.field} ({finding.name}): {finding.found}"
         if others:
-            text += f"; likewise {join_names([other.field for other in others])}"
+            text += f"; also {join_names([other.field for other in others])}"
         table.add_row(finding.severity, Text(_samples_text(finding)), Text(text), Text(finding.advice))
     return table
 

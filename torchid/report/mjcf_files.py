@@ -136,7 +136,7 @@ def _set_joints(
             element.set("armature", repr(armature[joint.name] - follow.get(joint.name, 0.0)))
     negative = [name for name, value in armature.items() if value < follow.get(name, 0.0)]
     if negative:
-        warn(f"{NAME}: negative armature at {join_names(negative)}; MuJoCo refuses it")
+        warn(f"{NAME}: MuJoCo refuses the negative armature of {join_names(negative)}.")
 
 
 def _joint_element(
@@ -192,7 +192,7 @@ def mjcf_of_urdf(
     warn_if_inconsistent(robot, model.phi, "MJCF")
     if model.left_out:
         names = join_names(list(dict.fromkeys(model.left_out)))
-        warn(f"{robot.path}: meshes that are not found, or that MuJoCo does not read, are left out: {names}")
+        warn(f"{robot.path}: meshes that MuJoCo cannot find or read are left out: {names}")
     etree.indent(model.root)
     return etree.tostring(model.root, encoding="utf-8", xml_declaration=True)
 

@@ -115,7 +115,7 @@ def read_shared_extras(path: Path, column: str = "value") -> dict[str, float]:
     extras = {}
     for entry in entries if isinstance(entries, list) else [None]:
         if not (isinstance(entry, dict) and isinstance(entry.get("label"), str)):
-            raise InputError(path, "extras", "an entry without a label", "what torchid identify wrote")
+            raise InputError(path, "extras", "an entry without a label", "a file written by torchid identify")
         value = _check_number(path, f"extras, {entry['label']}, {column}", entry.get(column))
         if entry.get("log") is None:
             extras[entry["label"]] = value

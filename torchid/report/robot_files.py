@@ -70,8 +70,8 @@ class FittedJoints:
             elif stiffness or constant:
                 lost.append(name)
         if lost:
-            warn(f"{file}: MJCF cannot say what was fitted of {join_names(lost)}: an offset without a spring, or a "
-                 "spring that pushes or moves several joints")  # fmt: skip
+            why = "(an offset without a spring, a negative stiffness, or a spring of coupled joints)"
+            warn(f"{file}: MJCF cannot express the fitted offset or spring of {join_names(lost)} {why}.")
         return springs
 
 
@@ -104,7 +104,7 @@ def refused_by_simulators(robot: Robot, phi: Array, fitted: FittedJoints) -> str
         from torchid.robot.mjcf import mujoco_error  # needs an extra
     except InputError:
         refused = [*massless_ends(robot, phi), *links_that_are_no_bodies(robot, phi)]
-        return f"no inertia that a body could have: {join_names(refused)}" if refused else ""
+        return f"inertia of {join_names(refused)} is not physically consistent" if refused else ""
     return mujoco_error(text, robot.path.parent)
 
 

@@ -128,8 +128,8 @@ def _error_table(columns: Mapping[str, Comparison[Metrics]], nominal_label: str)
         floors = [x.noise.get(group) for x in identified]
         if any(floor is not None for floor in floors):
             texts = ("-" if floor is None else f"{floor:.4g}" for floor in floors)
-            rows.append(["  noise alone", *(y for text in texts for y in ("", text))])
-    title = "Error of predicted forces: rms, and share of the rms of the measured; -: not measured"
+            rows.append(["  noise floor", *(y for text in texts for y in ("", text))])
+    title = "Error of predicted forces: rms (relative to the rms of the measured force); -: not measured"
     table = make_table(title, headings, rows)
     table.columns[0].no_wrap = True
     return table
@@ -175,7 +175,7 @@ def _rank_share_cell(state: Mapping[str, Any]) -> str:
 
 def noise_table(groups: Sequence[GroupNoise]) -> Table:
     """Standard deviations that weight the rows, by group."""
-    title = "Noise that weights the rows: standard deviations; residuals show what a filter leaves of it"
+    title = "Noise that weights the rows: standard deviations; residuals are filtered"
     rows = (
         (
             x.group,
@@ -189,7 +189,7 @@ def noise_table(groups: Sequence[GroupNoise]) -> Table:
 
 
 def noise_advice(suggested: Mapping[str, Any]) -> str:
-    """A line with the noise that should replace stated values, where residuals contradict them."""
+    """A line with the noise that should replace the stated noise, where residuals contradict it."""
 
     def text(x: float | Sequence[float] | Mapping[str, float]) -> str:
         if isinstance(x, Mapping):
@@ -199,7 +199,7 @@ def noise_advice(suggested: Mapping[str, Any]) -> str:
         return f"{x:g}" if isinstance(x, float) else "[" + ", ".join(f"{value:g}" for value in x) + "]"
 
     keys = ", ".join(f"{key}: {text(x)}" for key, x in suggested.items())
-    return f"stated values contradict the residuals: state sensors.noise {{{keys}}}, or none of these"
+    return f"The stated noise contradicts the residuals. Set sensors.noise {{{keys}}}, or state none of these."
 
 
 def marks_legend() -> str:
@@ -229,7 +229,7 @@ def verdict_counts_table(by_state: Mapping[str, Estimate], together: Estimate) -
 
     headings = ("in contact", "rank", "condition", *filter(None, MARKS.values()))
     rows = [*(row(*pair) for pair in by_state.items()), None, row("together", together)]
-    return make_table("Parameters by verdict, of each contact state alone and together", headings, rows)
+    return make_table("Parameters by verdict, of each contact state and of all together", headings, rows)
 
 
 def contribution_table(contributions: Contributions) -> Table:
@@ -252,7 +252,7 @@ def contribution_table(contributions: Contributions) -> Table:
     total = contributions.total
     rows.append(("everything", "", "", "", f"{total.determined:.1f}", f"{total.bits:.1f}"))
     headings = ("", "samples", "rank alone", "rank lost", "combinations lost", "bits lost")
-    return make_table(f"What each log{of_sensors} adds: lost without it", headings, rows)
+    return make_table(f"Information lost without each log{of_sensors}", headings, rows)
 
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
@@ -273,8 +273,8 @@ _MAX_ROWS = 30
 
 def extra_table(extras: Sequence[ExtraEstimate]) -> Table:
     """Extra parameters with standard errors, a row for each, a column for each log; `parameters.json` has them all."""
-    title = "Offsets, scales and actuators, with standard errors; ?: confounded with other parameters"
-    title += "; |: at a physical bound" if any(x.at_bound for x in extras) else ""
+    title = "Offsets, scales and actuator terms ± standard errors; ?: confounded with other parameters"
+    title += "; |: at a physical limit" if any(x.at_bound for x in extras) else ""
     logs = sorted(dict.fromkeys(x.log for x in extras), key=bool)  # terms common to all logs come first
     units = {x.extra.label: x.extra.unit for x in reversed(extras)}
     labels = list(dict.fromkeys(x.extra.label for x in extras))
@@ -355,7 +355,7 @@ def wrap_words(text: str, width: int, indent: str = "", most: int | None = None)
     while " " in last.strip() and len(last) > width - len(CUT):
         last = last[: last.rindex(" ")]
     kept = " ".join(line.strip() for line in (*before, last))
-    for end in "; ", ", ":
+    for end in ". ", "; ", ", ":
         clause = kept.rfind(end)
         shorter = wrap(kept[: clause + 1] + CUT, room, **options)
         if clause >= len(kept) / 2 and len(shorter) <= most:
@@ -420,7 +420,7 @@ def error_lines(errors: Sequence[tuple[str, float, float, float | None]], width:
     columns = [
         (nominal_label, [f"{before:.4g}" for _, before, _, _ in errors]),
         ("identified", [f"{after:.4g}" for _, _, after, _ in errors]),
-        ("noise alone", ["" if floor is None else f"{floor:.4g}" for *_, floor in errors]),
+        ("noise floor", ["" if floor is None else f"{floor:.4g}" for *_, floor in errors]),
     ]
     return column_lines(("rms error of", [group for group, *_ in errors]), columns, width) if errors else []
 

@@ -135,12 +135,12 @@ def warn_if_inconsistent(robot: Robot, phi: Array, file: str = "identified.urdf"
     bodies = [robot.bodies[number] for number in np.flatnonzero(phi.any(axis=1) & inconsistent)]
     if bodies:
         names = join_names([body.name for body in bodies])
-        message = f"{file}: no distribution of positive mass has the parameters of {names}"
-        warn(f"{message}; simulators will refuse or misread them")
+        warn(f"{file}: not physically consistent, simulators refuse or misread them: {names}. "
+             "Use estimator.name=consistent.")  # fmt: skip
     negative = [robot.bodies[number] for number in np.flatnonzero((phi[:, parameters.FRICTION] < 0.0).any(axis=1))]
     joints = [body.joint.name for body in negative if body.joint is not None]
     if joints:
-        warn(f"{file}: negative friction at {join_names(joints)}; simulators and torchid refuse it")
+        warn(f"{file}: simulators and torchid refuse the negative friction of {join_names(joints)}.")
 
 
 def _set_inertial(link: etree._Element, values: Array | None) -> None:
@@ -267,5 +267,5 @@ def resolve_meshes(root: etree._Element, urdf: Path, file: str) -> None:
                     link.remove(shape)
     if left_out:
         listed = join_names(list(dict.fromkeys(left_out)))
-        text = f"{file}: collisions with meshes that are not found, or are none of {', '.join(MUJOCO_MESHES)}"
-        warn(f"{text}, are left out, as MuJoCo would refuse them: {listed}; torchid export --format urdf keeps them")
+        text = f"{file}: collision meshes that MuJoCo cannot find or read are left out: {listed}"
+        warn(f"{text}. To keep them, use torchid export --format urdf.")

@@ -55,7 +55,7 @@ def analysis_lines(analysis: Analysis, width: int) -> list[str]:
     for text in attention[:_MOST_ATTENTION]:
         lines += labelled("attention", text, width, _TEXT_LINES)
     if len(attention) > _MOST_ATTENTION:
-        lines += labelled("", f"and {len(attention) - _MOST_ATTENTION} more: --verbose", width)
+        lines += labelled("", f"{len(attention) - _MOST_ATTENTION} more: --verbose", width)
     lines += _accuracy_lines(analysis.accuracies, LINES - len(lines) - 1, width)
     return [*lines, written_line(analysis.output)]
 
@@ -92,7 +92,7 @@ def _lost(scenario: ScenarioAnalysis) -> int:
 
 
 def _headline(scenarios: Sequence[ScenarioAnalysis]) -> str:
-    """The verdict on the sensors, of scenarios of which the worst comes first."""
+    """The verdict on the sensors; the worst scenario comes first."""
     if not scenarios:  # a process that only helps
         return ""
     worst = scenarios[0]
@@ -103,8 +103,8 @@ def _headline(scenarios: Sequence[ScenarioAnalysis]) -> str:
         where = f"{lost} of {format_count(len(worst.states), 'contact state')}"
         if several:
             bad = f"{sum(_lost(scenario) > 0 for scenario in scenarios)} of {len(scenarios)} scenarios"
-            where = f"{bad}, first of all in {where} of {worst.name}"
-        return f"The sensors of the file do not suffice: the base is lost in {where}"
+            where = f"{bad} (in {where} of {worst.name})"
+        return f"The sensors of the file do not suffice: the base is unobservable in {where}."
     count = len(worst.plan.chosen)
     states = sum(len(scenario.states) for scenario in scenarios)
     if worst.proposed is not None:
@@ -114,40 +114,38 @@ def _headline(scenarios: Sequence[ScenarioAnalysis]) -> str:
     else:
         sensors = f"{format_count(count, 'sensor')} suffice{'s' * (count == 1)}" if count else "No sensor is needed"
     return (
-        f"{sensors}: the base is observable in {f'all {states} contact states' if states > 1 else 'the contact state'}"
+        f"{sensors}: the base is observable in {f'all {states} contact states' if states > 1 else 'the contact state'}."
     )
 
 
 def _stack_headline(scenario: ScenarioAnalysis) -> str:
-    """What sensors determine that are judged by all samples together."""
+    """What the sensors determine, if all samples together are judged."""
     plan = scenario.plan
     base = scenario.base
     if scenario.proposed is not None:  # of a robot with a fixed base
-        combinations = f"{base.rank} combinations of {int(base.free.sum())} parameters"
-        return f"The sensors of the file determine at best {combinations}, all samples together"
+        return f"The sensors of the file determine at best {base.rank} base parameters of {int(base.free.sum())}."
     sensors = f"{len(plan.chosen)} of {len(plan.problem.candidates)} sensors"
-    share = f"{plan.stack_rank} of the {plan.stack_full} inertial combinations that all would"
-    return f"{sensors} determine {share}, all samples together"
+    return f"{sensors} determine {plan.stack_rank} of the {plan.stack_full} inertial base parameters of all sensors."
 
 
 def _determined_text(scenario: ScenarioAnalysis) -> str:
-    """How many parameters are known alone, how many in sums, and how many are unobservable."""
+    """How many parameters are determined alone, in combinations, and not at all."""
     base = scenario.base
     names = scenario.plan.problem.robot.body_names
     alone = int((np.count_nonzero(base.combination, axis=1) == 1).sum())
     seen = int(base.combination.any(axis=0).sum())
     free = int(base.free.sum())
-    sums = f"{seen - alone} only in {format_count(base.rank - alone, 'sum')}"
+    sums = f"{seen - alone} only in {format_count(base.rank - alone, 'combination')}"
     bodies = [line.partition(":")[0] for line in unobservable_parameters(base, names)]
-    unobservable = f"{free - seen} unobservable{f' (of {join_names(bodies)})' if bodies else ''}"
-    return f"at best {alone} of {free} parameters alone, {sums}, {unobservable}; base_parameters.txt"
+    unobservable = f"{free - seen} not at all{f' (of {join_names(bodies)})' if bodies else ''}"
+    return f"at best {alone} of {free} parameters alone, {sums}, {unobservable}; see base_parameters.txt"
 
 
 def _smallest_text(scenario: ScenarioAnalysis) -> str:
     plan = scenario.plan
     is_own = bool(scenario.proposed) and scenario.proposed is plan.observability
-    names = "that of the file" if is_own else candidate_names(plan.chosen)
-    aim = " for the inertia, friction aside" if plan.problem.criterion == "stack" else ""
+    names = "the set of the file" if is_own else candidate_names(plan.chosen)
+    aim = " for the inertia (without friction)" if plan.problem.criterion == "stack" else ""
     return f"{format_count(len(plan.chosen), 'sensor')}{aim}, cost {plan.cost:g}, {plan.proof}: {names}"
 
 
@@ -158,16 +156,14 @@ def _scenario_lines(scenarios: Sequence[ScenarioAnalysis], width: int) -> list[s
         for scenario, judged in zip(scenarios, states, strict=True)
     ]
     columns = [
-        ("base lost in", lost),
-        ("combinations", [f"{scenario.base.rank} of {int(scenario.base.free.sum())}" for scenario in scenarios]),
+        ("base unobservable", lost),
+        ("base parameters", [f"{scenario.base.rank} of {int(scenario.base.free.sum())}" for scenario in scenarios]),
         ("smallest set", [format_count(len(scenario.plan.chosen), "sensor") for scenario in scenarios]),
         ("cost", [f"{scenario.plan.cost:g}" for scenario in scenarios]),
         ("proven", ["yes" if scenario.plan.proven else "no" for scenario in scenarios]),
     ]
     names = [scenario.name for scenario in scenarios]
-    return rows_within(
-        ("scenario", names), columns, width, _MOST_SCENARIOS + 2, "scenarios more: analysis.json, --verbose"
-    )
+    return rows_within(("scenario", names), columns, width, _MOST_SCENARIOS + 2, "more scenarios: --verbose")
 
 
 def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Iterator[str]:
@@ -184,8 +180,8 @@ def _attention(analysis: Analysis, scenarios: Sequence[ScenarioAnalysis]) -> Ite
         for scenario in scenarios:
             accuracy = analysis.accuracies.get("proposed" if scenario.proposed is not None else scenario.plan_label)
             if accuracy is not None and accuracy.rank < scenario.base.rank:
-                what = f"the logs determine {accuracy.rank} of {scenario.base.rank} combinations"
-                yield f"{what}: record motion that differs more, of all joints and of the base"
+                what = f"The logs determine {accuracy.rank} of {scenario.base.rank} base parameters"
+                yield f"{what}. Record more varied motion of all joints and of the base."
     yield from contradicting_messages(analysis.without)
     yield from confounded_messages(analysis.accuracies, in_short=True)
     for scenario in scenarios:
@@ -197,7 +193,7 @@ def _accuracy_lines(sets: Mapping[str, SetAccuracy], room: int, width: int) -> l
     if all(accuracy.measured is None for accuracy in sets.values()):
         return []
     if room < _FEWEST_ROWS:
-        return labelled("compared", f"{format_count(len(sets), 'sensor set')}: analysis.json, --verbose", width)
+        return labelled("compared", f"{format_count(len(sets), 'sensor set')}: --verbose", width)
     errors = [accuracy.measured.rms for accuracy in sets.values() if accuracy.measured is not None]
     columns = [
         (label, ["" if (rms := rms_by_group.get(group)) is None else f"{rms:.3g}" for rms_by_group in errors])
@@ -205,7 +201,7 @@ def _accuracy_lines(sets: Mapping[str, SetAccuracy], room: int, width: int) -> l
     ]
     columns += [("rank", [str(accuracy.rank) for accuracy in sets.values()])]
     names = ("rms error, measured", list(sets))
-    return ["", *rows_within(names, columns, width, room - 1, "sensor sets more: analysis.json, --verbose")]
+    return ["", *rows_within(names, columns, width, room - 1, "more sensor sets: --verbose")]
 
 
 # --------------------------------------------------------------------------------------------------------- all tables
@@ -216,7 +212,7 @@ def _scenario_parts(scenario: ScenarioAnalysis, width: int) -> list[str | Table]
     base = scenario.base
     parts: list[str | Table] = [f"Scenario {scenario.name}", branch_table(plan)]
     parts += [sets_table(plan.parts)] if plan.parts else []
-    proof = "no cheaper set exists" if plan.proven else "whether a cheaper set exists is not proven"
+    proof = "no cheaper set exists" if plan.proven else "a cheaper set may exist"
     parts += labelled("chosen", candidate_names(plan.chosen), width)
     parts += labelled("cost", f"{plan.cost:g}; {proof}", width)
     named = {"Chosen sensors": plan.observability}
@@ -228,8 +224,8 @@ def _scenario_parts(scenario: ScenarioAnalysis, width: int) -> list[str | Table]
             for message in (*describe_losses(states), *describe_singular_postures(states)):
                 parts += labelled("attention", message, width)
     parts += [removal_table(plan)] if plan.removals else []
-    structure = f"{base.rank} combinations of {int(base.free.sum())} parameters"
-    parts += labelled("structure", f"{structure}; base_parameters.txt names them", width)
+    structure = f"{base.rank} base parameters of {int(base.free.sum())} parameters"
+    parts += labelled("structure", f"{structure}; see base_parameters.txt", width)
     return [*parts, *labelled("determined", _determined_text(scenario), width), ""]
 
 
@@ -311,15 +307,15 @@ def _is_clean(log: Checked) -> bool:
 def _verdict(checked: Sequence[Checked]) -> str:
     """The verdict on all logs."""
     if len(checked) == 1:
-        usual = "; free of usual mistakes" if _is_clean(checked[0]) else ""
+        usual = "; no mistake found" if _is_clean(checked[0]) else ""
         return f"{log_heading(checked[0])}: {checked[0].verdict}{usual}"
     clean, usable = (sum(map(condition, checked)) for condition in (_is_clean, lambda log: log.usable))
     if clean == len(checked):
-        return f"{clean} of {format_count(clean, 'log')} are free of usual mistakes"
+        return f"No mistake found in {format_count(clean, 'log')}."
     shortened = sum(log.usable and bool(log.rejected.any()) for log in checked)
-    without = f", {shortened} of them without some samples" if shortened else ""
-    free = f"{clean or 'none'} {'is' if clean < 2 else 'are'} free of usual mistakes"
-    return f"{usable} of {format_count(len(checked), 'log')} {'is' if usable == 1 else 'are'} usable{without}; {free}"
+    without = f" ({shortened} without some samples)" if shortened else ""
+    usable_logs = f"{usable} of {format_count(len(checked), 'log')} {'is' if usable == 1 else 'are'} usable{without}"
+    return f"{usable_logs}; {clean or 'none'} without a mistake."
 
 
 def _finding_lines(groups: Sequence[_Alike], room: int, width: int, logs: int) -> list[str]:
@@ -329,7 +325,7 @@ def _finding_lines(groups: Sequence[_Alike], room: int, width: int, logs: int) -
         texts = [_finding_text(group, width, logs, most) for group in groups]
         lines = [line for text in texts for line in text]
         is_whole = most is None and all(len(group.by_log) == 1 for group in groups)
-        end = [] if is_whole else ["all in full: --verbose"]
+        end = [] if is_whole else ["full text: --verbose"]
         if len(lines) + len(end) <= room:
             return lines + end
     shown = sum(last < room for last in accumulate(map(len, texts)))
@@ -341,9 +337,9 @@ def _finding_text(group: _Alike, width: int, logs: int, most: int | None) -> lis
     (log, findings), *others = group.by_log.items()
     where = f" in {log_title(log)}" if logs > 1 else ""
     if others:
-        where += f", likewise {join_names([log_title(other) for other, _ in others], _NAMED - 1)}"
+        where += f", also {join_names([log_title(other) for other, _ in others], _NAMED - 1)}"
     fields = join_names(list(dict.fromkeys(finding.field for finding in findings)))
-    what = f"{fields}, {group.first.name}{where}: {group.first.found}"
+    what = f"{fields} ({group.first.name}){where}: {group.first.found}"
     return [*labelled(group.first.severity, what, width, most), *labelled("", f"do: {group.first.advice}", width, most)]
 
 
@@ -364,7 +360,7 @@ def _log_lines(checked: Sequence[Checked], room: int, width: int) -> list[str]:
         ("seconds", [f"{log.log.time[-1] - log.log.time[0]:.4g}" for log in order]),
     ]
     names = ("log", [log_title(log.log.source) for log in order])
-    return ["", *rows_within(names, columns, width, room - 1, "logs more, no worse than these: --verbose")]
+    return ["", *rows_within(names, columns, width, room - 1, "more logs without worse findings: --verbose")]
 
 
 def _severity(log: Checked) -> tuple[float, ...]:
@@ -385,8 +381,8 @@ def _skipped_lines(checked: Sequence[Checked], most: int, width: int) -> list[st
             reasons.setdefault(name, []).append(reason)
     texts = []
     for name, of_logs in reasons.items():
-        alike = " or alike" if len(set(of_logs)) > 1 else ""
-        where = "" if len(of_logs) == len(checked) else f", {len(of_logs)} of {len(checked)} logs"
+        alike = " or similar" if len(set(of_logs)) > 1 else ""
+        where = "" if len(of_logs) == len(checked) else f", in {len(of_logs)} of {len(checked)} logs"
         texts.append(f"{name} ({of_logs[0]}{alike}{where})")
     text = f"{format_count(len(texts), 'check')}: {'; '.join(texts)}"
     return labelled("not checked", text, width, most) if texts else []

@@ -18,10 +18,8 @@ from torchid.commands.training import body_eigenvalues
 from torchid.errors import format_count, join_names
 from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, Estimate, SgdEstimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
-from torchid.fitting.noise import Misfit
 from torchid.parameters import COULOMB, FIRST_MOMENT, MASS, PARAMETERS, PER_BODY, VISCOUS, Array
 from torchid.problem.metrics import (
-    DECISIVE_GROUPS,
     PRESSURE,
     WHITENED,
     describe_errors,
@@ -60,8 +58,8 @@ _TEXT_LINES = 2
 _ATTENTION_LINES = 3
 _FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
 _LEGEND = {
-    COMBINED: "+ known only in sums with other bodies",
-    PRIOR: "p mostly the {of}'s",
+    COMBINED: "+ identified only in sums with other bodies",
+    PRIOR: "p mostly from the {of}",
     UNOBSERVABLE: ". unobservable",
 }
 _MOST_DIGITS = 5  # behind the point
@@ -85,7 +83,7 @@ def answer_lines(run: Identification, width: int, last: Sequence[tuple[str, str]
     for text, most in zip(said.attention, (_ATTENTION_LINES, *[_TEXT_LINES] * (_MOST_ATTENTION - 1)), strict=False):
         lines += labelled("attention", text, width, most)
     if len(said.attention) > _MOST_ATTENTION:
-        lines += labelled("", f"and {len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
+        lines += labelled("", f"{len(said.attention) - _MOST_ATTENTION} more: --verbose", width, _TEXT_LINES)
     output = run.experiment.config.output
     end = [] if output is None else [written_line(output)]
     end += [line for label, text in last for line in labelled(label, text, width, _TEXT_LINES)]
@@ -111,7 +109,7 @@ def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list
     marks = {word for line in lines[1:] for word in line.split()[1:]}
     if len(free) > len(shown):
         what = "mass" if (estimate.phi.reshape(-1, PER_BODY) != robot.nominal)[free, MASS].any() else "friction"
-        lines.append(f"and {len(free) - len(shown)} bodies whose {what} changed less: --verbose")
+        lines.append(f"and {len(free) - len(shown)} bodies with a smaller change of {what}: --verbose")
     legend = "; ".join(text.format(of=robot.format) for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks)
     return [*lines, *([shorten(legend, width, placeholder=CUT)] if legend else [])]
 
@@ -132,7 +130,7 @@ def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tu
 
     def cells(parameter: int) -> list[str]:
         if parameter != MASS and set(verdict[:, parameter]) <= {FIXED, UNOBSERVABLE}:
-            return [""] * len(bodies)  # friction, of which sensors outside of the joints tell nothing
+            return [""] * len(bodies)  # friction, which sensors outside of the joints do not see
         return [_cell(*(x[k, parameter] for x in (phi, error, verdict))) for k in bodies]
 
     masses = [
@@ -189,11 +187,13 @@ def detail_parts(run: Identification, width: int, last: Sequence[tuple[str, str]
     parts: list[str | Table] = [*wrap_words(said.headline, width)]
     parts += [line for text in said.attention for line in labelled("attention", text, width)]
     if not run.misfit.explained:
-        parts += labelled("unexplained", _misfit_text(run.misfit), width)
+        growth = run.misfit.error_growth or 0.0
+        errors = f"; standard errors are {growth:.2g} times (median) those of noise alone" * (growth > 1.0)
+        parts += labelled("unexplained", f"{run.misfit}{errors}", width)
     parts += [state_table([asdict(state) for state in run.states]), *error_tables(run.metrics, robot.format)]
     if 0 < run.evaluated["train"] < run.samples:
         count = f"{run.evaluated['train']} of {run.samples} samples, evenly spaced"
-        parts += labelled("train", f"errors of forces of {count}", width)
+        parts += labelled("train", f"errors are those of {count}", width)
     parts += [contribution_table(run.contributions), verdict_table(robot.body_names, estimate.verdict)]
     parts += [verdict_counts_table(run.by_state, estimate), *noise_parts(run.noise, width)]
     if run.extras:
@@ -201,19 +201,12 @@ def detail_parts(run: Identification, width: int, last: Sequence[tuple[str, str]
     if run.violations:
         parts.append(violation_table(run.violations_by_name()))
         if type(estimate) is Estimate:
-            parts.append("estimator.name=consistent finds the best parameters that break none of them")
+            parts.append("Use estimator.name=consistent: its parameters meet all conditions.")
     parts += rolling_lines(run.experiment.rolling, width)
     key_figures = (*_fit_texts(run), *_choice_texts({**run.choices.by_name(), "ridge": run.ridge}), *_end_texts(run))
     parts += [line for label, text in key_figures for line in labelled(label, text, width)]
     parts.append(written_line(run.experiment.config.output))
     return [*parts, *(line for label, text in last for line in labelled(label, text, width))]
-
-
-def _misfit_text(misfit: Misfit) -> str:
-    growth = ""
-    if misfit.error_growth is not None and misfit.error_growth > 1.0:
-        growth = f"; standard errors are {misfit.error_growth:.2g} times (median) what noise alone would make of them"
-    return f"{misfit}{growth}"
 
 
 def _fit_texts(run: Identification) -> Iterator[tuple[str, str]]:
@@ -225,16 +218,13 @@ def _fit_texts(run: Identification) -> Iterator[tuple[str, str]]:
     yield "minimized", minimized_errors(robot, run.experiment.contacts, sensors) + weighted
     yield "parameters", f"{estimate.rank} independent combinations of {int(estimate.phi.size)} identified"
     yield "condition", f"{estimate.condition_number:.3g}"
-    noise_alone = "" if run.misfit.expected is None else f"; {run.misfit.expected:.3g} are left by noise alone"
-    yield "residual", f"{estimate.residual_std:.3g} standard deviations of that noise{noise_alone}"
+    noise_alone = "" if run.misfit.expected is None else f"; noise alone gives {run.misfit.expected:.3g}"
+    yield "residual", f"{estimate.residual_std:.3g} standard deviations of the noise{noise_alone}"
     if run.motion_noise.combinations:
         yield "motion noise", str(run.motion_noise)
     if run.validation is not None:
-        identified = run.validation.identified
-        nominal = run.validation.nominal
-        texts = (describe_errors(group, identified.rms_of(group), nominal.rms_of(group)) for group in DECISIVE_GROUPS)
-        blocks = f"each of {run.validation.folds} blocks, against {robot.format}"
-        yield "held out", f"{blocks}: {'; '.join(filter(None, texts))}"
+        errors = describe_errors(run.validation.nominal, run.validation.identified)
+        yield "held out", f"{run.validation.folds} blocks, {robot.format} -> identified: {errors}"
 
 
 def _choice_texts(choices: Mapping[str, object]) -> Iterator[tuple[str, str]]:
@@ -249,17 +239,17 @@ def _end_texts(run: Identification) -> Iterator[tuple[str, str]]:
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     yield "consistency", f"smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}"
     if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
-        yield "objective", f"{100.0 * estimate.relative_increase:.3g} % above the least without conditions"
+        yield "objective", f"{100.0 * estimate.relative_increase:.3g} % above the optimum without constraints"
     if isinstance(estimate, ConsistentEstimate) and estimate.active:
         yield "at bounds", f"{len(estimate.active)}: {join_names(estimate.active, _NAMED)}"
     if isinstance(estimate, SgdEstimate):
         yield "training", f"{estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}"
-    yield "total mass", f"{run.mass} ({robot.format}: {decimal(run.mass.nominal)} kg)"
+    yield "total mass", answer(run).total_mass
     if run.robust is not None:
         kept = f"{100 * run.robust.mean_weight:.3g} % of the weight kept"
         yield "robust", f"{run.robust.loss}, {kept}, {run.robust.passes} passes"
     if robot.massless:
-        yield "left out", f"massless: {', '.join(robot.massless)}"
+        yield "massless", f"{', '.join(robot.massless)}: not fitted"
     timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
     yield "time", f"{run.samples} samples: {timed}"
 
@@ -279,7 +269,8 @@ def compression_parts(done: Compression, width: int, verbose: bool = False) -> l
 def compression_lines(files: Sequence[CompressedFile], width: int, most: int | None = None) -> list[str]:
     """How much was compressed to how little, and the files, in at most so many lines of at most so many columns."""
     samples, size = (sum(x) for x in zip(*((file.samples, file.size) for file in files), strict=True))
-    said = f"{format_count(len(files), 'log')}, {format_count(samples, 'sample')}, in {size / 1e6:.3g} MB of factors"
+    counts = f"{format_count(len(files), 'log')} ({format_count(samples, 'sample')})"
+    said = f"{counts} compressed to {size / 1e6:.3g} MB of factors."
     head = wrap_words(said, width)
     room = len(files) + 2 if most is None else most - len(head) - 1  # the folder
     columns = [
@@ -288,7 +279,7 @@ def compression_lines(files: Sequence[CompressedFile], width: int, most: int | N
         ("rows", [str(file.rows) for file in files]),
         ("contact states", [str(file.states) for file in files]),
     ]
-    return [*head, *rows_within(("file", [file.name for file in files]), columns, width, room, "files more: --verbose")]
+    return [*head, *rows_within(("file", [file.name for file in files]), columns, width, room, "more files: --verbose")]
 
 
 MOST_LOGS = 8
@@ -311,19 +302,19 @@ def evaluation_lines(evaluated: EvaluatedRun, width: int) -> list[str]:
     shown = [_sentence(errors, evaluated.explained) for errors in judged[:MOST_LOGS]]
     lines = [line for sentence in shown for line in wrap_words(sentence, width, "  ")]
     if len(judged) > MOST_LOGS:
-        lines.append(f"and {len(judged) - MOST_LOGS} logs that are predicted better than these: --verbose")
+        lines.append(f"and {len(judged) - MOST_LOGS} logs with smaller errors: --verbose")
     if len(judged) == 1:
         lines += error_lines(judged[0].shown_errors(), width, file_kind)
     for name, errors in evaluated.with_residual.items():
         without = evaluated.metrics[name].identified
         pairs = [(x, errors.rms_of(x), without.rms_of(x)) for x in ("joint_torque", WHITENED)]
         said = [f"{group_name(x)} {a:.3g}, without it {b:.3g}" for x, a, b in pairs if a is not None and b is not None]
-        lines += wrap_words(f"{name} with the learned module: {'; '.join(said)}", width, "  ")
+        lines += wrap_words(f"{name} with the learned module: {'; '.join(said)}.", width, "  ")
     if (far := evaluated.far_off()) is not None:
         lines += labelled("attention", far, width, _ATTENTION_LINES)
     left_out = sum(evaluated.excluded.values())
     if left_out:
-        lines.append(f"{'left out':{LABEL}}{left_out} samples that torchid check rejects")
+        lines.append(f"{'left out':{LABEL}}{format_count(left_out, 'sample')} that torchid check rejects")
     return [*lines, written_line(evaluated.output)]
 
 
@@ -334,8 +325,8 @@ def evaluation_parts(evaluated: EvaluatedRun) -> list[str | Table]:
 
 def _sentence(errors: ErrorComparison, explained: bool) -> str:
     worse = worse_than_nominal({errors.text: (errors.nominal, errors.identified)})
-    doubt = "" if explained else "; residuals of the run's own logs are not noise alone"
-    return f"WORSE THAN {errors.of}: {describe_worse(worse, errors.of)}" if worse else f"{errors.headline()}{doubt}"
+    doubt = "" if explained else " The model does not explain the run's own logs."
+    return describe_worse(worse, errors.of) or f"{errors.headline()}{doubt}"
 
 
 def _worst(errors: ErrorComparison) -> float:
@@ -355,22 +346,19 @@ def sample_lines(drawn: DrawnSamples, width: int, verbose: bool = False) -> list
     few = len(table) < _FEWEST_FOR_TAILS
     ends, titles = ((0.0, 0.5, 1.0), ("least", "median", "largest")) if few else (_ENDS, ("2.5 %", "median", "97.5 %"))
     total = np.quantile(table[:, MASS : len(fitted.posterior.nominal) : PER_BODY].sum(axis=1), ends)
-    lines = wrap_words(
-        f"{format_count(len(table), 'robot')} that can exist; {'all' if few else '95 % of them'} weigh {total[0]:.4g} "
-        f"to {total[2]:.4g} kg. "
-        f"Prior: nominal bodies may be off by {100.0 * drawn.prior_error:.3g} % (--prior-error).",
-        width,
-        "  ",
-    )
+    weigh = f"{'all' if few else '95 % of them'} weigh {total[0]:.4g} to {total[2]:.4g} kg"
+    prior = f"The prior lets each body deviate from the file by {100.0 * drawn.prior_error:.3g} % (--prior-error)"
+    robots = f"{format_count(len(table), 'physically consistent robot')}: {weigh}."
+    lines = wrap_words(f"{robots} {prior}.", width, "  ")
     nominal_error = fitted.nominal_error
     if nominal_error is not None and nominal_error.prior_is_narrow and drawn.prior_error < nominal_error.value:
-        lines += wrap_words(f"  {nominal_error}: ranges are too narrow; --prior-error auto takes that.", width, "  ")
+        lines += wrap_words(f"{nominal_error}. Ranges are too narrow: use --prior-error auto.", width, "  ")
     numbers = _shown(drawn, table, verbose)
     ranges = np.quantile(table[:, numbers], ends, axis=0)
     names = [fitted.parameter_names[number] for number in numbers]
     columns = [(title, [f"{x:.4g}" for x in row]) for title, row in zip(titles, ranges, strict=True)]
-    lines += column_lines(("widest, in SI units" if not verbose else "parameter", names), columns, width)
-    where = "no file: --output samples.npz, ranges.json or, with --format urdf, a folder"
+    lines += column_lines(("widest ranges (SI)" if not verbose else "parameter", names), columns, width)
+    where = "no file: use --output FILE.npz, FILE.json or a folder"
     return [*lines, written_line(where if drawn.output is None else drawn.output)]
 
 

@@ -10,10 +10,11 @@ from collections.abc import Collection, Mapping
 
 from rich.table import Table
 
+from torchid.commands.answer import times_smaller
 from torchid.commands.replay import Replay
 from torchid.commands.simulate import nominal_name, simulated_balls
 from torchid.config import SimulationConfig
-from torchid.errors import format_count, format_percent
+from torchid.errors import format_count
 from torchid.report.tables import (
     LINES,
     column_lines,
@@ -41,7 +42,7 @@ def simulation_lines(config: SimulationConfig, stabilities: Mapping[str, Stabili
     end = labelled("rolling", balls, width, _TEXT_LINES) if (balls := simulated_balls(config)) else []
     nominal = nominal_name(config)
     kind = "URDF" if config.robot.mjcf is None else "MJCF"
-    text = f"logs/ and {nominal}; the truth: exact/ and the simulated {kind}"
+    text = f"use logs/ and {nominal}; true values: exact/ and the simulated {kind}"
     end += labelled("to identify", text, width, _TEXT_LINES)
     end.append(written_line(config.output))
     room = LINES - len(lines) - len(end)
@@ -61,10 +62,10 @@ def _headline(config: SimulationConfig, stabilities: Mapping[str, Stability]) ->
     motions = format_count(len(stabilities), "motion")
     slip = 1e3 * max(x.slip for x in stabilities.values())
     margin = 1e3 * min(x.zmp_margin for x in stabilities.values())
-    bounds = f"feet slip by at most {slip:.1f} mm, the zero-moment point stays {margin:.0f} mm inside the support"
+    bounds = f"feet slip at most {slip:.1f} mm, the zero-moment point stays {margin:.0f} mm inside the support"
     effort = max(x.effort for x in stabilities.values())
     limits = f", torques reach {100 * effort:.0f} % of their limits" if effort else ""
-    return f"The robot stands throughout {motions}, {seconds:.4g} s: {bounds}{limits}"
+    return f"The robot stands during {motions} ({seconds:.4g} s): {bounds}{limits}."
 
 
 def _motion_lines(config: SimulationConfig, stabilities: Mapping[str, Stability], room: int, width: int) -> list[str]:
@@ -79,7 +80,7 @@ def _motion_lines(config: SimulationConfig, stabilities: Mapping[str, Stability]
 
     order = sorted(stabilities, key=lambda name: use(stabilities[name]), reverse=True)
     columns = _columns([stabilities[name] for name in order])
-    return rows_within(("motion", order), columns, width, room, "motions farther from the bounds: --verbose")
+    return rows_within(("motion", order), columns, width, room, "more motions: --verbose")
 
 
 def _columns(stabilities: Collection[Stability]) -> list[tuple[str, list[str]]]:
@@ -123,7 +124,7 @@ def replay_lines(replayed: Replay, width: int, verbose: bool = False) -> list[st
     ]
     headings = (f"joint, after {replayed.window:g} s", [name for name, _ in joints])
     room = len(joints) + 1 if verbose else _MOST + 2
-    lines += ["", *rows_within(headings, cells, width, room, "joints drifting less: --verbose")]
+    lines += ["", *rows_within(headings, cells, width, room, "joints with less drift: --verbose")]
     if replayed.output is not None:
         lines.append(written_line(replayed.output))
     return lines
@@ -134,13 +135,8 @@ def _drift(replayed: Replay) -> str:
     drifts = replayed.at(replayed.window)
     what = Counter(name.partition(" [")[0] for name in drifts)  # with units where joints have two
     named = {name: bare if what[bare := name.partition(" [")[0]] == 1 else name for name in drifts}
-    shares = [
-        f"{named[name]} {format_percent(after / before)} %" if before else named[name]
-        for name, (before, after) in drifts.items()
-    ]
-    worse = any(after > before for before, after in drifts.values())
-    head = f"WORSE THAN {replayed.of}: drift" if worse else "Drift"
-    share = f"of {replayed.driven} alone, as a share of the {replayed.of}'s"
-    return (
-        f"{head} after {replayed.window:g} s {share}: {', '.join(shares)} ({format_count(replayed.windows, 'window')})"
-    )
+    ratios = {named[name]: after / before for name, (before, after) in drifts.items() if before}
+    compared = ", ".join(f"{name} {times_smaller(ratio, ratio)}" for name, ratio in ratios.items())
+    worse = f"WORSE THAN {replayed.of}: " * any(after > before for before, after in drifts.values())
+    head = f"{worse}Drift after {replayed.window:g} s, driven by {replayed.driven}, compared with the {replayed.of}"
+    return f"{head}: {compared} ({format_count(replayed.windows, 'window')})."

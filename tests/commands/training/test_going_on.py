@@ -177,7 +177,7 @@ def test_a_signal_ends_a_training_with_a_line_on_how_to_go_on(
         stopped_in(7, monkeypatch, interrupt(number))
         assert main(command(experiment, output)) == 1
     printed = capsys.readouterr()
-    assert printed.err == "torchid: interrupted in epoch 6; --resume goes on after epoch 6\n"
+    assert printed.err == "torchid: interrupted in epoch 6. Use --resume to continue after epoch 6.\n"
     assert printed.out == ""
     assert not output.exists()
     assert main(command(experiment, output, "--resume")) == 0
@@ -193,7 +193,7 @@ def test_what_came_after_the_last_checkpoint_is_done_again(
         with pytest.MonkeyPatch.context() as monkeypatch:
             stopped_in(epoch, monkeypatch, interrupt())
             assert main(command(experiment, output, seldom, *resume)) == 1
-        expected = f"torchid: interrupted in epoch {epoch - 1}; --resume goes on after epoch {saved}\n"
+        expected = f"torchid: interrupted in epoch {epoch - 1}. Use --resume to continue after epoch {saved}.\n"
         assert capsys.readouterr().err == expected
     assert main(command(experiment, output, seldom, "--resume")) == 0
     assert_as_uninterrupted(output, run)

@@ -68,7 +68,7 @@ def test_other_logs_are_not_gone_on_with(
         line = resume_refused(experiment, output, capsys)
     finally:
         shutil.move(tmp_path / "kept.npz", experiment / "train.npz")
-    assert "experiment.yaml: logs: not those of the checkpoint; accepted: the same files, unchanged" in line
+    assert "experiment.yaml: logs: differ from those of the checkpoint; accepted: the same files, unchanged" in line
 
 
 @pytest.mark.parametrize("name", ["least_squares", "consistent"])
@@ -77,7 +77,7 @@ def test_what_is_done_in_one_go_is_not_gone_on_with(
 ) -> None:
     arguments = ["identify", str(DEMO / "quadruped.yaml"), f"estimator.name={name}", f"output={tmp_path / 'run'}"]
     line = refusal([*arguments, "--resume"], tmp_path, capsys)
-    assert f"quadruped.yaml: --resume: {name}, which is done in one go; accepted: estimator.name: sgd" in line
+    assert f"quadruped.yaml: --resume: {name} has nothing to resume; accepted: estimator.name: sgd" in line
 
 
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
@@ -100,7 +100,7 @@ def test_a_damaged_checkpoint_is_not_gone_on_with(
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
     line = resume_refused(experiment, output, capsys)
     assert f"{path}: file: not readable (" in line
-    assert line.endswith("accepted: a checkpoint that torchid wrote")
+    assert line.endswith("accepted: a checkpoint written by torchid")
 
 
 def test_a_full_disk_is_told_as_such_and_leaves_the_last_checkpoint(tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_nothing_to_learn_is_noticed_before_anything_is_written(
 ) -> None:
     bodies = ", ".join(torchid.load_robot(DEMO / "quadruped.urdf").body_names)
     line = refusal(command(experiment, tmp_path / "run", f"estimator.frozen=[{bodies}]"), tmp_path, capsys)
-    assert "experiment.yaml: sensors: no parameter is in reach of them" in line
+    assert "experiment.yaml: sensors: they determine no parameter" in line
 
 
 def test_overrides_may_come_before_and_after_options_and_strangers_are_refused(
