@@ -117,7 +117,7 @@ def test_no_repr_is_longer_than_ten_lines(things: Mapping[str, object]) -> None:
         ("trainer", "Trainer: epoch 0 of 3"),
         ("identification", "Identification of quadruped.urdf, 13 bodies, 12 joints, by consistent"),
         ("identification", "data        1250 samples of 1 log"),
-        ("identification", "total mass  21.435 ± 0.15 kg (URDF: 20.800 kg; ± includes 2 % gain error)"),
+        ("identification", "total mass  21.435 ± 0.15 kg (URDF: 20.800 kg; 1 sigma, with 2 % gain error)"),
         ("identification", "written to  no folder"),
         ("body estimate", "± 0.025 kg m, identified"),
         ("metrics", "Metrics: joint torque 0.0725 N m (6.8 %), base force 0.616 N (0.51 %), base moment 0.146 N m"),

@@ -107,7 +107,7 @@ def test_a_command_in_its_own_process_writes_the_files_that_it_writes_without_fo
     )
     assert alone.keys() == copied.keys()
     pictures = [name for name in alone if name.endswith(".png")]
-    assert len(pictures) == 10
+    assert len(pictures) == 9
     assert all(alone[name] == copied[name] for name in pictures)
     ridges = [json.loads(files["metrics.json"])["ridge_selection"] for files in (alone, copied)]
     assert ridges[0] == ridges[1]

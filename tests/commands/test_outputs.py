@@ -203,7 +203,7 @@ def test_a_run_lists_every_file_of_its_own(copy: Path, place: Path, server: Comm
     names = {str(path.relative_to(copy)) for path in copy.rglob("*") if path.is_file()}
     evaluation = {name for name in names if name.startswith("evaluation/")}
     assert set(manifest.files) == names - evaluation - {MANIFEST}
-    assert len(evaluation) == 6
+    assert len(evaluation) == 7
     assert (
         server.run(["identify", str(place / "demo" / "quadruped.yaml"), f"output={copy}", "overwrite=true"]).status == 0
     )

@@ -140,7 +140,7 @@ def test_bodies_that_cannot_exist_are_counted_with_what_to_do(consistent: Identi
     assert len(bodies) > 2
     advice = "simulators refuse them. Use estimator.name=consistent"
     assert f"{len(bodies)} of 13 not physically consistent; {advice}" in " ".join(text(free).split())
-    assert "all 13 physically consistent; load in MuJoCo" in text(consistent)
+    assert "all 13 physically consistent; valid in MuJoCo" in text(consistent)
     assert "not physically consistent" not in text(consistent)
 
 
@@ -149,7 +149,7 @@ def test_a_file_that_simulators_refuse_is_not_said_to_be_taken(consistent: Ident
     phi[3, 1:10] = 0.0  # a point mass at the axis that moves it, which breaks no condition
     said = " ".join(text(replace(consistent, estimate=replace(consistent.estimate, phi=phi.flatten()))).split())
     assert "all 13 physically consistent, but MuJoCo refuses the file: " in said
-    assert "load in MuJoCo" not in said
+    assert "valid in MuJoCo" not in said
 
 
 def test_a_total_mass_that_contradicts_the_urdf_needs_attention(consistent: Identification) -> None:
@@ -364,7 +364,7 @@ def test_the_bodies_that_changed_most_are_listed_in_the_robots_order(consistent:
             assert value == pytest.approx(phi[body, k], abs=0.5 * errors[body, k])
             assert error == pytest.approx(errors[body, k], rel=0.1)
     assert f"and {13 - len(rows)} bodies with a smaller change of mass: --verbose" in "\n".join(lines)
-    assert "+ identified only in sums with other bodies" in lines
+    assert "+ identified only in sums with other bodies; ± 1 sigma" in lines
 
 
 def test_friction_that_no_joint_shows_has_no_columns(consistent: Identification) -> None:

@@ -59,7 +59,7 @@ def test_a_terminal_of_a_few_columns_gets_all_the_same() -> None:
 def test_the_verdict_comes_first_and_the_worst_finding_next_with_what_to_do() -> None:
     logs = [checked("clean", WEIGHT), checked("spiked", SPIKE, SIGN), checked("degrees", DEGREES)]
     assert text(logs).startswith(
-        "2 of 3 logs are usable (1 without some samples); 1 without a mistake. "
+        "2 of 3 logs are usable (1 without some samples); findings in 2. "
         "rejected joint_position (unit) in degrees.npz: more than two turns: degrees do: convert to radians "
         "rejected joint_torque (spike) in spiked.npz: excursions of 200 N m"
     )

@@ -98,7 +98,7 @@ def test_a_run_whose_model_does_not_explain_its_own_logs_says_so_of_others(run: 
         lacking = torchid.evaluate(run, LOG)
     finally:
         file.write_text(json.dumps(document))
-    assert evaluation_lines(lacking, 400)[0].endswith("smaller. The model does not explain the run's own logs.")
+    assert evaluation_lines(lacking, 400)[0].endswith("residuals are not noise alone: intervals are too narrow.")
 
 
 def test_samples_left_out_are_counted(evaluated: EvaluatedRun) -> None:

@@ -192,8 +192,9 @@ def _total_mass(run: Results) -> str:
     gain = run.experiment.config.sensors.gain_error
     file_kind = run.experiment.robot.format
     counted = run.mass.determined and run.estimate.gain_error is not None and run.estimate.gain_error.any()
-    gains = f"; ± includes {100.0 * gain:g} % gain error" if counted else ""
-    return f"{run.mass} ({file_kind}: {decimal(run.mass.nominal)} kg{gains})"
+    error = "; 1 sigma" if run.mass.determined else ""
+    gains = f", with {100.0 * gain:g} % gain error" if counted else ""
+    return f"{run.mass} ({file_kind}: {decimal(run.mass.nominal)} kg{error}{gains})"
 
 
 def _judge(run: Results) -> ErrorComparison:
@@ -220,7 +221,7 @@ def _bodies_text(run: Results) -> str:
             return f"physically consistent, but MuJoCo refuses joints that move no mass: {join_names(ends)}"
         if run.refused:
             return f"all {count} physically consistent, but MuJoCo refuses the file: {run.refused}"
-        return f"all {count} physically consistent; load in MuJoCo"
+        return f"all {count} physically consistent; valid in MuJoCo"
     bodies = {violation.body for violation in run.violations} - {None}
     which = f"{len(bodies)} of {count}" if bodies else "all together"
     advice = ". Use estimator.name=consistent" if type(run.estimate) is Estimate else ""

@@ -351,7 +351,7 @@ def check_contact_flags(log: Log, robot: Robot | None = None) -> Iterator[Findin
         return
     contacts = list(_contacts(log))
     if not contacts:
-        yield Skipped(_FLAG_CHECK, "every contact lacks its force in some samples of contact")
+        yield Skipped(_FLAG_CHECK, "no contact has its force in all samples of contact")
         return
     judged = {contact.name for contact in contacts}
     for name in (name for name in log.contact_names if name not in judged):
@@ -511,7 +511,7 @@ CLEAR_SLIP = 2.0
 """Least peak speed over the limit for a finding: noise of cameras and encoders has long tails."""
 
 _SLIP_CHECK = "slip of contacts"
-_ADVICE = "set preprocessing.max_slip: auto to exclude these samples; look for dust, a soft floor or late flags"
+_ADVICE = "nothing if only joint torques are fitted; else preprocessing.max_slip: auto. Check for dust and late flags"
 
 
 def check_slip(

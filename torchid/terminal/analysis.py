@@ -315,7 +315,7 @@ def _verdict(checked: Sequence[Checked]) -> str:
     shortened = sum(log.usable and bool(log.rejected.any()) for log in checked)
     without = f" ({shortened} without some samples)" if shortened else ""
     usable_logs = f"{usable} of {format_count(len(checked), 'log')} {'is' if usable == 1 else 'are'} usable{without}"
-    return f"{usable_logs}; {clean or 'none'} without a mistake."
+    return f"{usable_logs}; findings in {len(checked) - clean}."
 
 
 def _finding_lines(groups: Sequence[_Alike], room: int, width: int, logs: int) -> list[str]:

@@ -110,8 +110,9 @@ def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list
     if len(free) > len(shown):
         what = "mass" if (estimate.phi.reshape(-1, PER_BODY) != robot.nominal)[free, MASS].any() else "friction"
         lines.append(f"and {len(free) - len(shown)} bodies with a smaller change of {what}: --verbose")
-    legend = "; ".join(text.format(of=robot.format) for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks)
-    return [*lines, *([shorten(legend, width, placeholder=CUT)] if legend else [])]
+    legend = [text.format(of=robot.format) for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks]
+    legend += ["± 1 sigma"] * any("±" in line for line in lines)
+    return [*lines, *([shorten("; ".join(legend), width, placeholder=CUT)] if legend else [])]
 
 
 def _most_changed(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[int]:
@@ -325,7 +326,7 @@ def evaluation_parts(evaluated: EvaluatedRun) -> list[str | Table]:
 
 def _sentence(errors: ErrorComparison, explained: bool) -> str:
     worse = worse_than_nominal({errors.text: (errors.nominal, errors.identified)})
-    doubt = "" if explained else " The model does not explain the run's own logs."
+    doubt = "" if explained else " In the run's own logs, residuals are not noise alone: intervals are too narrow."
     return describe_worse(worse, errors.of) or f"{errors.headline()}{doubt}"
 
 
