@@ -105,8 +105,8 @@ def _weight_findings(carried: float, when: str, field: str, robot: Robot | None)
     more = format_percent(ratio - 1.0, "+")
     text = f"contacts carry {mass:.4g} kg {when}, but the {robot.format} has {nominal:.4g} kg ({more} %)"
     if units := units_of_ratio(ratio, ("force",)):
-        text = f"contacts carry {ratio:.3g} times the robot's weight {when}. Are forces in {' or '.join(units)}?"
-        yield Finding("unit", REJECTED, field, text, "convert forces to N and moments to N m")
+        unit_text = f"contacts carry {ratio:.3g} times the robot's weight {when}. Are forces in {' or '.join(units)}?"
+        yield Finding("unit", REJECTED, field, unit_text, "convert forces to N and moments to N m")
         return
     if abs(ratio - 1.0) > MAX_MASS_ERROR:
         advice = "check for an unmeasured contact, a payload, a sensor offset and a wrong gain"
@@ -187,8 +187,8 @@ def _gravity_finding(mean: float, size: float, text: str, units: tuple[str, ...]
     field = "imu_specific_force"
     original = "give the raw reading of the accelerometer"
     if units:
-        text = f"{text.replace(' m/s^2', '')}. Is the unit {' or '.join(units)}?"
-        return Finding("unit", REJECTED, field, text, f"{advise_units({field: units})}, or convert it to m/s^2")
+        unit_text = f"{text.replace(' m/s^2', '')}. Is the unit {' or '.join(units)}?"
+        return Finding("unit", REJECTED, field, unit_text, f"{advise_units({field: units})}, or convert it to m/s^2")
     if mean < _MAX_MEAN_WITHOUT_GRAVITY * GRAVITY and size < _MAX_SIZE_WITHOUT_GRAVITY * GRAVITY:
         advice = f"{original}: acceleration minus gravity, 9.81 m/s^2 upward at rest"
         return Finding("gravity", REJECTED, field, f"{text}: gravity was removed", advice)
@@ -196,8 +196,8 @@ def _gravity_finding(mean: float, size: float, text: str, units: tuple[str, ...]
         advice = f"{original}, without added gravity; or halve it if the sensor's range is half of what was assumed"
         return Finding("gravity", REJECTED, field, f"{text}: twice gravity", advice)
     if rests and abs(size / GRAVITY - 1.0) > _MAX_ACCELEROMETER_ERROR:
-        text += f", but gravity is {GRAVITY}"
-        return Finding("gravity", SUSPICIOUS, field, text, "calibrate the accelerometer")
+        advice = "calibrate the accelerometer"
+        return Finding("gravity", SUSPICIOUS, field, f"{text}, but gravity is {GRAVITY}", advice)
     return None
 
 
@@ -241,8 +241,8 @@ def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -
     text = f"the accelerometer's up is {angle:.3g} degrees from up by base_quat {when}"
     if (level := int(np.argmin(angles))) < 2 and angles[level] < _MAX_TILT_DEG:
         advice = f"rotate the world so that z points up, or check imu_frame in the {robot.format}"
-        text += f". Does the world's {'xy'[level]} axis point up?"
-        yield Finding("gravity", SUSPICIOUS, "base_quat_xyzw", text, advice)
+        question = f"Does the world's {'xy'[level]} axis point up?"
+        yield Finding("gravity", SUSPICIOUS, "base_quat_xyzw", f"{text}. {question}", advice)
         return
     if angle <= 90.0:
         if angle > _MAX_TILT_DEG:
@@ -255,7 +255,7 @@ def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -
         advice = "reverse it if it is gravity minus acceleration, or check imu_frame and the order of the quaternion"
         yield Finding("gravity", REJECTED, name, f"{text}{below}. Is the reading reversed?", advice)
     else:
-        text += ", and the base is above its feet. Does the world's z axis point down?"
+        text = f"{text}, and the base is above its feet. Does the world's z axis point down?"
         advice = "rotate the world so that z points up, or check the order of the quaternion"
         yield Finding("gravity", REJECTED, "base_quat_xyzw", text, advice)
 
@@ -511,7 +511,6 @@ CLEAR_SLIP = 2.0
 """Least peak speed over the limit for a finding: noise of cameras and encoders has long tails."""
 
 _SLIP_CHECK = "slip of contacts"
-_ADVICE = "nothing if only joint torques are fitted; else preprocessing.max_slip: auto. Check for dust and late flags"
 
 
 def check_slip(
@@ -547,7 +546,10 @@ def check_slip(
     for contact, own, stands, peak in zip(contacts, slips.T, standing.tolist(), fastest.tolist(), strict=True):
         if peak >= CLEAR_SLIP and own.sum() <= MOST_SLIPPING_SHARE * stands:
             text = f"{contact.frame} slips on the ground in {int(own.sum())} samples"
-            yield Finding("slip", SUSPICIOUS, "contact_active", text, _ADVICE, (contact.frame,), tuple(find_spans(own)))
+            advice = (
+                "nothing if only joint torques are fitted; else preprocessing.max_slip: auto. Check for dust and late flags"
+            )
+            yield Finding("slip", SUSPICIOUS, "contact_active", text, advice, (contact.frame,), tuple(find_spans(own)))
 
 
 # ---------------------------------------------------------------------------------------------- limb sensors in the air

@@ -318,8 +318,10 @@ def _contradiction(unexplained: float, model: NominalModel) -> Finding:
     form = model.robot.format
     share = format_percent(UNMODELLED_FORCE_SHARE * unexplained)
     text = f"{share} % of the forces are unexplained, even with small changes of the {form}'s parameters"
-    advice = "check units, frames, friction, the order of joints and contacts,"
-    advice += f" the {form}'s base link and masses, and that the {form} describes this robot"
+    advice = (
+        f"check units, frames, friction, the order of joints and contacts, the {form}'s base link and masses, and that"
+        f" the {form} describes this robot"
+    )
     if not model.contacts and not model.robot.fixed_base:
         advice = f"list under contacts what touches the ground or holds the base; or {advice}"
     return Finding("forces", SUSPICIOUS, "all", text + UNEXPLAINED, advice)

@@ -35,12 +35,10 @@ from torchid.rounding import STD_PER_MAD
 MAX_ANGLE_RAD = 4.0 * np.pi
 #: Median speed of the joints: motors of legs reach 20 to 30 rad/s.
 MAX_SPEED_RAD_S = 40.0
-_UNIT_ADVICE = "convert joint_position, joint_velocity and joint_acceleration to radians"
 DEAD_ENCODER_ADVICE = "check whether the joint moves; if it does, its encoder is dead: do not use this log"
 #: Descriptions of mistakes, and what to do.
 QUATERNION_ORDER = "wrong order: w first and w last are confused", "rename base_quat_wxyz and base_quat_xyzw"
 INVERSE_QUATERNION = "rotates world to base, not base to world", "give the inverse"
-_DERIVE_ADVICE = "remove the field: torchid then derives it"
 
 
 def check_angle_unit(log: Log, robot: Robot | None) -> Iterator[Finding]:
@@ -60,16 +58,17 @@ def check_angle_unit(log: Log, robot: Robot | None) -> Iterator[Finding]:
     if 2 * int(far.sum()) < int(moved.sum()):
         far &= has_stops
     names = [log.joint_names[columns[i]] for i in np.flatnonzero(far)]
+    advice = "convert joint_position, joint_velocity and joint_acceleration to radians"
     if far.any():
         text = f"{join_names(names)}: up to {np.abs(position[:, far]).max():.4g} rad, more than two turns. In degrees?"
         certain = 0 < int((moved & has_stops).sum()) <= 2 * int((far & has_stops).sum())
         severity = REJECTED if certain else SUSPICIOUS
-        yield Finding("unit", severity, "joint_position", text, _UNIT_ADVICE, tuple(names))
+        yield Finding("unit", severity, "joint_position", text, advice, tuple(names))
     elif len(log) > 2:
         speed = np.percentile(np.abs(np.diff(position, axis=0)) / np.diff(log.time)[:, None], 90.0, axis=0)
         if float(np.median(speed)) > MAX_SPEED_RAD_S:
             text = f"half of the joints exceed {np.median(speed):.3g} rad/s. Are angles in degrees, or time in ms?"
-            yield Finding("unit", SUSPICIOUS, "joint_position", text, _UNIT_ADVICE)
+            yield Finding("unit", SUSPICIOUS, "joint_position", text, advice)
 
 
 # ----------------------------------------------------------------- comparison of recorded derivatives with their bases
@@ -203,6 +202,7 @@ def _derivative_findings(
         for ratio, ok in zip(comparison.ratio, follows, strict=True)
     ]
     named = np.array([meaning is not None for meaning in meanings], bool)
+    derive = "remove the field: torchid then derives it"
     for meaning in dict.fromkeys(meaning for meaning in meanings if meaning is not None):
         mask = np.array([other == meaning for other in meanings])
         text = f"{comparison.ratio[mask][0]:.4g} times the derivative of {base}: {meaning[0]}"
@@ -211,15 +211,15 @@ def _derivative_findings(
     if off.any():
         worst = int(np.argmax(np.abs(np.log(np.where(off, np.abs(comparison.ratio), 1.0) + _TINY))))
         text = f"{comparison.ratio[worst]:.3g} times the derivative of {base} ({channels[worst]})"
-        yield _finding("ratio", SUSPICIOUS, name, channels, off, text, _DERIVE_ADVICE)
+        yield _finding("ratio", SUSPICIOUS, name, channels, off, text, derive)
     late = follows & (np.abs(comparison.delay) >= MIN_DELAY_SAMPLES)
     if late.any():
         typical = float(np.median(comparison.delay[late]))
         text = f"{'lags' if typical > 0 else 'leads'} the derivative of {base} by {abs(typical):.3g} samples"
-        yield _finding("delay", SUSPICIOUS, name, channels, late, text, _DERIVE_ADVICE)
+        yield _finding("delay", SUSPICIOUS, name, channels, late, text, derive)
     if lost.any():
         text = f"does not follow the derivative of {base} (correlation {np.nanmin(np.abs(comparison.correlation)):.2f})"
-        advice = f"check the {'order of its joints' if name.startswith('joint') else 'frame'}, or {_DERIVE_ADVICE}"
+        advice = f"check the {'order of its joints' if name.startswith('joint') else 'frame'}, or {derive}"
         yield _finding("derivative", SUSPICIOUS, name, channels, lost, text, advice)
 
 

@@ -149,8 +149,10 @@ def check_time_stamps(log: Log) -> Iterator[Finding]:
     if short.any():
         numbers = np.flatnonzero(short)
         first = int(numbers[0])
-        text = f"{format_count(len(numbers), 'step')} below {SHORTEST_STEP:g} of the median amplify noise;"
-        text += f" the first, after sample {first}, is {steps[first]:.3g} s"
+        text = (
+            f"{format_count(len(numbers), 'step')} below {SHORTEST_STEP:g} of the median amplify noise;"
+            f" the first, after sample {first}, is {steps[first]:.3g} s"
+        )
         spans = tuple(Span(int(i) + 1, int(i) + 1) for i in numbers)
         yield Finding("coincident stamps", REJECTED, "time", text, "drop one sample of each pair", spans=spans)
 

@@ -169,8 +169,10 @@ def _single_foot(
     frame = min(remaining, key=lambda name: remaining[name], default="")
     if not frame or remaining[frame] > MAX_OTHERS_SHARE * slip:
         return None
-    text = f"{frame} moves though its flag is on: standing feet move {format_percent(slip)} % as much as the base,"
-    text += f" {format_percent(remaining[frame])} % without it"
+    text = (
+        f"{frame} moves though its flag is on: standing feet move {format_percent(slip)} % as much as the base,"
+        f" {format_percent(remaining[frame])} % without it"
+    )
     advice = "check zeros, scales and signs of the joint positions in its limb, its flags, and whether it slips"
     if still := join_names(still_in_limb(log, robot, frame)):
         text += f". {still} in its limb never moves: is its encoder dead?"
@@ -225,8 +227,10 @@ def _pose_finding(x: FloatArray, slip: float, residual: float) -> Finding:
     parts = [f"of a point at ({at}) mm of the base link"] if x[:3].any() else []
     parts += [f"turned about it by ({turn}) degrees"] if x[3:6].any() else []
     parts += [f"{1e3 * abs(x[6]):.0f} ms {'late' if x[6] > 0.0 else 'early'}"] if x[6] else []
-    text = f"standing feet move {format_percent(slip)} % as much as the base, but {format_percent(residual)} % of that"
-    text += f" if the base's pose is {join_names(parts)}"
+    text = (
+        f"standing feet move {format_percent(slip)} % as much as the base, but {format_percent(residual)} % of that"
+        f" if the base's pose is {join_names(parts)}"
+    )
     advice = "give the pose of the base link itself; shift_s corrects a late file"
     return Finding("frame", SUSPICIOUS, "base_quat_xyzw", text, advice)
 
@@ -247,8 +251,10 @@ def _radius_findings(log: Log, robot: Robot, contacts: Sequence[Contact], poses:
     error = np.linalg.norm(weight * (products - radius * unit)) / max(weight @ unit, np.finfo(float).tiny)
     stated = float(np.mean([c.radius for c in points]))
     if radius > 0.0 and abs(radius - stated) > max(_RADIUS_SHARE * max(radius, stated), _RADIUS_ERRORS * error):
-        text = f"standing feet roll like balls with a radius of {1e3 * radius:.3g} mm (± {1e3 * error:.1g});"
-        text += f" the stated radius is {1e3 * stated:.3g} mm. Creeping feet seem smaller"
+        text = (
+            f"standing feet roll like balls with a radius of {1e3 * radius:.3g} mm (± {1e3 * error:.1g});"
+            f" the stated radius is {1e3 * stated:.3g} mm. Creeping feet seem smaller"
+        )
         centre = f", centre: {join_numbers(points[0].centre)}" if any(points[0].centre) else ""
         entry = f"{{frame: {points[0].frame}, type: point, radius: {radius:.3g}{centre}}}"
         advice = f"set contacts: [{entry}, ...] if the feet are balls"

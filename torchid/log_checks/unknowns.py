@@ -390,16 +390,16 @@ def _single_wrenches(frames: Sequence[str], estimate: Estimate, robot: Robot, fi
         size = float(np.linalg.norm(turn))
         gain = 1.0 + float(x)
         angle = float(np.arctan2(size, gain))
+        fits = f"{name}: the {robot.format} fits best"
         if gain > 0.0 and angle > MIN_TURN:
             axis = ", ".join(f"{y:.2g}" for y in np.round(np.array(turn) / size, 2))
             kind = "frame"
-            text = f"if forces are turned by {np.degrees(angle):.2g} degrees about ({axis})"
+            text = f"{fits} if forces are turned by {np.degrees(angle):.2g} degrees about ({axis})"
             advice = "check the sensor's mounting and the frame of its readings"
         else:
             kind = "scale" if gain > 0.0 else "sign"
-            text = f"with a factor of {gain:.3g} +- {std:.2g} on its forces"
+            text = f"{fits} with a factor of {gain:.3g} +- {std:.2g} on its forces"
             advice = "check the sensor's sign, gain and unit, and whether the readings belong to another foot"
-        text = f"{name}: the {robot.format} fits best {text}"
         out.append(Finding(kind, SUSPICIOUS, field, text, advice, (name,)))
     return out
 
@@ -643,10 +643,12 @@ def _lag_kinds(filtered: FilteredLog, equations: ForceEquations, derived: tuple[
             start = 1e3 * (estimate.value[0] - 0.5 * estimate.value[1])
             end = 1e3 * (estimate.value[0] + 0.5 * estimate.value[1])
             rate = 100.0 * float(estimate.value[1]) / duration
-            text = f"{clock.what} {start:.3g} ms later than {clock.than} at the start and {end:.3g} ms at the end"
-            text += f" (+- {1e3 * estimate.spread[1]:.2g} ms). Their clock is {abs(rate):.2g} %"
+            speed = "fast" if rate > 0.0 else "slow"
+            text = (
+                f"{clock.what} {start:.3g} ms later than {clock.than} at the start and {end:.3g} ms at the end"
+                f" (+- {1e3 * estimate.spread[1]:.2g} ms). Their clock is {abs(rate):.2g} % {speed}"
+            )
             advice = "stamp all sensors with one clock, or scale the time of these to match"
-            text += " fast" if rate > 0.0 else " slow"
             return [Finding("clock", SUSPICIOUS, clock.field, text, advice, clock.channels)]
 
         both = columns(filtered.pieces, equations, clock, 2)
