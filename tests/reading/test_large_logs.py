@@ -136,9 +136,7 @@ def test_a_channel_with_gaps_is_nan_in_the_parts_that_have_them(tmp_path: Path) 
     fields["joint_torque"][:, 0] = np.nan
     fields["joint_torque"][[17, 8_900], 2] = np.nan
     file = experiment(tmp_path, fields)
-    with pytest.warns(
-        TorchidWarning, match=r"samples 0 to \d+ of 9000, numbered from there\): joint_torque: NaN in part"
-    ):
+    with pytest.warns(TorchidWarning, match=r"samples 0 to \d+ of 9000, counted from 0\): joint_torque: NaN in part"):
         large = samples_of(file, *overrides({"cutoff_hz": 20}), SMALL, required=False)
     torque = value(large.torque)
     assert torque[:, 0].isnan().all()

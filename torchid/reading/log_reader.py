@@ -176,7 +176,7 @@ class LogReader:
         time = blocks.time
         beyond = _overlap(time, settings.filter_hz)
         around = slice(max(piece.start - beyond, 0), min(piece.stop + beyond, len(time)))
-        name = f"{path} (samples {around.start} to {around.stop - 1} of {len(time)}, counted from the first)"
+        name = f"{path} (samples {around.start} to {around.stop - 1} of {len(time)}, counted from {around.start})"
         with about_file(path if around == slice(0, len(time)) else name):
             log = blocks.read(around, settings.exclude_rejected, settings.bridge_gaps_s)
         samples = self.samples_of(log, path, required)
