@@ -285,7 +285,10 @@ def test_a_descent_that_ended_above_the_optimum_says_so(consistent: Identificati
     shared = {name: x for name, x in vars(consistent.estimate).items() if name in own}
     for excess, told in ((0.002, False), (0.29, True), (None, True)):
         descent = {"epochs": 9, "best_epoch": 9, "residual": None, "excess": excess}
-        said = text(replace(consistent, estimate=SgdEstimate(**shared | descent)), 400)
+        misfit = replace(consistent.misfit, residual=9.0)
+        assert not misfit.explained
+        said = text(replace(consistent, misfit=misfit, estimate=SgdEstimate(**shared | descent)), 400)
+        assert ("Friction, compliance or contacts are missing" in said) is not told
         assert ("attention     Not converged" in said) is told
         assert ("Not converged: 29 % above the optimum" in said) is (excess == 0.29)
 

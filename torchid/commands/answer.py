@@ -244,10 +244,11 @@ def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
     fitted = f" (the fit: {decimal(mass.value)} kg, {file_kind}: {decimal(mass.nominal)} kg)" * is_off
     adopted = run.choices.adopted_terms
     independent = f"{run.samples / estimate.oversampling:.0f} independent samples"
+    unfinished = list(_unfinished(estimate))
     rules = (
         (bool(run.worse), ADVICE),
         (bool(run.suspected), f"torchid check finds in {run.suspected}"),
-        *((True, text) for text in _unfinished(estimate)),
+        *((True, text) for text in unfinished),
         *((True, text) for text in _unlike_sensors(judged.identified)),
         *((True, text) for text in _computed(judged)),
         (bool(terms), f"The fit makes {join_names(terms)} negative: impossible. Use estimator.name=consistent."),
@@ -257,7 +258,7 @@ def _attention(run: Results, judged: ErrorComparison) -> Iterator[str]:
         *((True, text) for text in _driving(run)),
         *((True, text) for text in _unlike_joints(run)),
         *((True, text) for text in _heavy(run)),
-        (not run.misfit.explained,
+        (not run.misfit.explained and not unfinished,
          f"Friction, compliance or contacts are missing, or a sensor is wrong (torchid check): {run.misfit.in_short}"),
         *((True, text) for text in _resting(run)),
         (contradicts, f"The total mass is {ratio:.3g} times the {file_kind}'s. Weigh the robot, or correct units and "
