@@ -101,7 +101,7 @@ BAD: list[tuple[str, str, list[str], str]] = [
     ("absent.npz", "out.h5", [], "absent.npz: file: no such file"),
     ("in.npz", "out.mat", [], "extension '.mat'; accepted: .npz, .h5, .hdf5, .csv, .parquet"),
     ("in.npz", "out.mcap", [], "extension '.mcap'; accepted: .npz"),
-    ("in.npz", "nowhere/out.h5", [], "OUT: no folder"),
+    ("in.npz", "nowhere/out.h5", [], "OUT: the folder "),
     ("in.npz", "out", [], "extension ''"),
     ("x.bag", "out.h5", [], "logs.topics: missing; the bag has /joint_states (sensor_msgs/msg/JointState)"),
     ("x.bag", "out.h5", ["--topics", "absent.yaml"], "absent.yaml: file: cannot be read"),

@@ -123,5 +123,5 @@ def test_a_plate_that_lies_elsewhere_is_noticed(tmp_path: Path, capsys: pytest.C
     write_log(replace(log, contact_wrench_world=about_origin, moments_about_world_origin=True), tmp_path / "walk.npz")
     main(["check", str(tmp_path / "walk.npz"), "--urdf", str(folder / "human.urdf")])
     printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "contact_wrench_world, point" in printed
+    assert "contact_wrench_world (point)" in printed
     assert "check the reference points of" in printed

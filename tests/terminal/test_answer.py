@@ -13,6 +13,7 @@ from demo import shortened_demo
 from repository import DEMO
 
 from torchid.cli import _options, main
+from torchid.commands.answer import times_smaller
 from torchid.commands.identify import identify
 from torchid.commands.run_folder import Identification
 from torchid.config import load_config
@@ -72,6 +73,20 @@ def test_the_errors_on_unseen_motion_come_first_with_the_noise(consistent: Ident
     assert "total mass" in said
     assert f"{consistent.mass.value:.3f} ± " in said
     assert str(consistent.experiment.config.output) in " ".join(said.split("\n")[-1:])
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "said"),
+    [
+        (0.071, 0.25, "4 to 14 times smaller"),
+        (0.5, 0.5, "2 times smaller"),
+        (0.0, 0.96, "1.04 to over 1000 times smaller"),
+        (0.5, 1.25, "1.25 times larger to 2 times smaller"),
+        (1.0, 3.0, "1 to 3 times larger"),
+    ],
+)
+def test_errors_are_compared_as_times_smaller(least: float, most: float, said: str) -> None:
+    assert times_smaller(least, most) == said
 
 
 def test_joints_that_rest_are_named_where_forces_are_not_explained(consistent: Identification) -> None:

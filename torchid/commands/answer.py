@@ -81,7 +81,7 @@ class ErrorComparison:
             return f"No measured forces to compare with the {self.of} on {self.text}."
         least = min(ratios)
         most = max(ratios)
-        error = f"the error is {times_smaller(least, most)}"
+        error = f"the error is {times_smaller(most if most <= 1.1 * least else least, most)}"
         known = [after / floor for _, _, after, floor in self.errors() if floor]
         if known and max(known) < AT_THE_FLOOR:
             error += ", as small as the noise floor"

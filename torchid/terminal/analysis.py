@@ -137,8 +137,8 @@ def _determined_text(scenario: ScenarioAnalysis) -> str:
     free = int(base.free.sum())
     sums = f"{seen - alone} only in {format_count(base.rank - alone, 'combination')}"
     bodies = [line.partition(":")[0] for line in unobservable_parameters(base, names)]
-    unobservable = f"{free - seen} not at all{f' (of {join_names(bodies)})' if bodies else ''}"
-    return f"at best {alone} of {free} parameters alone, {sums}, {unobservable}; see base_parameters.txt"
+    unobservable = f", {free - seen} not at all (of {join_names(bodies)})" if bodies else ""
+    return f"at best {alone} of {free} parameters alone, {sums}{unobservable}; see base_parameters.txt"
 
 
 def _smallest_text(scenario: ScenarioAnalysis) -> str:
