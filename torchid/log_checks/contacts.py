@@ -546,7 +546,10 @@ def check_slip(
     for contact, own, stands, peak in zip(contacts, slips.T, standing.tolist(), fastest.tolist(), strict=True):
         if peak >= CLEAR_SLIP and own.sum() <= MOST_SLIPPING_SHARE * stands:
             text = f"{contact.frame} slips on the ground in {int(own.sum())} samples"
-            advice = "nothing if only joint torques are fitted; else preprocessing.max_slip: auto. Check for dust and late flags"
+            advice = (
+                "nothing if only joint torques are fitted; else preprocessing.max_slip: auto."
+                " Check for dust and late flags"
+            )
             yield Finding("slip", SUSPICIOUS, "contact_active", text, advice, (contact.frame,), tuple(find_spans(own)))
 
 
