@@ -11,6 +11,7 @@ import inspect
 import re
 import typing
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -272,7 +273,7 @@ def _remarks(path: Path) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant | ast.JoinedStr) and id(node) not in described:
             text = _texts(node, {})[0] if isinstance(node, ast.JoinedStr) or id(node) not in parts else ""
-            if len(text.split()) >= _FEWEST_WORDS and text[0] not in " ,;":
+            if _words(text) >= _FEWEST_WORDS and text[0] not in " ,;":
                 yield text
 
 
@@ -282,8 +283,20 @@ def _errors(path: Path) -> Iterator[tuple[str, str]]:
         for call in _calls(function, _ERROR_CLASSES):
             if len(call.args) >= 3:
                 wrong, accepted = (_alternatives(x, function, function.lineno, call.lineno) for x in call.args[-2:])
-                if len(wrong.split()) + len(accepted.split()) >= _FEWEST_WORDS:
+                if _words(wrong) + _words(accepted) >= _FEWEST_WORDS:
                     yield wrong, accepted
+
+
+def _words(text: str) -> int:
+    return sum(any(letter.isalpha() for letter in word) for word in text.split())
+
+
+@cache
+def _constants() -> dict[str, list[ast.expr]]:
+    """Texts that modules of the log checks give a name."""
+    trees = (ast.parse(path.read_text()) for path in (_PACKAGE / "log_checks").glob("*.py"))
+    assigned = (node for tree in trees for node in tree.body if isinstance(node, ast.Assign))
+    return {node.targets[0].id: [node.value] for node in assigned if isinstance(node.targets[0], ast.Name)}
 
 
 def _calls(function: ast.FunctionDef, names: Sequence[str]) -> list[ast.Call]:
@@ -299,7 +312,7 @@ def _alternatives(node: ast.expr, function: ast.FunctionDef, above: int, line: i
     for statement in ast.walk(function):
         if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name) and statement.lineno < line:
             assigned.setdefault(statement.targets[0].id, []).append((statement.lineno, statement.value))
-    known = {}
+    known = dict(_constants())
     for name, values in assigned.items():
         recent = [value for number, value in values if number > above]
         known[name] = recent or [max(values, key=lambda value: value[0])[1]]
