@@ -140,7 +140,7 @@ def test_the_table_of_files_says_what_is_in_them(
         str(found.rows),
         str(len(found.by_state)),
     ]
-    assert lines[0] == f"2 logs, {2 * KEPT} samples, in {sum(sizes.values()) / 1e6:.3g} MB of factors"
+    assert lines[0] == f"2 logs ({2 * KEPT} samples) compressed to {sum(sizes.values()) / 1e6:.3g} MB of factors."
     assert cells in [line.split() for line in lines]
 
 

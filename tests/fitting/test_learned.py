@@ -70,5 +70,5 @@ def test_a_run_with_networks_is_evaluated_with_them(tmp_path: Path, capsys: pyte
     document = evaluated.to_dict()[name]["with_residual"]
     assert isinstance(document, dict)
     assert np.isfinite([x for x in document.values() if isinstance(x, float)]).all()
-    with pytest.warns(torchid.TorchidWarning, match="the learned module goes by torch.export"):
+    with pytest.warns(torchid.TorchidWarning, match="For the learned module use torch.export"):
         export(run, "urdf")

@@ -123,7 +123,7 @@ def test_friction_that_the_model_lacks_is_said_before_all_else(
     assert lacking["unfitted_friction"] > 100.0
     assert "friction, which is not fitted, explains" in lacking["message"]
     said = " ".join(told["false"][1].split())
-    assert "attention friction, compliance or contacts are missing" in said
+    assert "attention Friction, compliance or contacts are missing" in said
     assert "unexplained residuals are 11 times" in said
 
 

@@ -79,5 +79,5 @@ def test_what_cannot_be_carried_is_refused() -> None:
     robot = load(SOLO12)
     with pytest.raises(UnknownNameError, match=r"payload\.link: unknown name 'FL_FOTO'; accepted: .*FL_FOOT"):
         payload_parameters(robot, [Payload("FL_FOTO", 1.0, (0.0, 0.0, 0.0))])
-    with pytest.raises(ConfigError, match=r"payload\.inertia: \[1\.0, .* no body has; accepted: ixx"):
+    with pytest.raises(ConfigError, match=r"payload\.inertia: \[1\.0, .* is not physically consistent; accepted: ixx"):
         payload_parameters(robot, [Payload("FL_FOOT", 1.0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.1, 0.0, 0.1))])

@@ -91,7 +91,7 @@ def test_weights_of_one_are_no_weights_to_the_last_bit(demo: Path) -> None:
             "{joint_torque: {'*': 1, '*_elbow': 5}}",
             "task_weights.joint_torque: unknown name '*_elbow'; accepted: front_",
         ),
-        ("{joint_torque: {'*_knee': 5}}", "task_weights.joint_torque: no weight of front_left_hip; accepted: one for"),
+        ("{joint_torque: {'*_knee': 5}}", "task_weights.joint_torque: no weight for front_left_hip; accepted: one for"),
         ("{base_force: 0}", "task_weights.base_force: found 0; accepted: a number greater than 0, or three"),
         ("{base: 2}", "task_weights: unknown name 'base'; accepted: base_force, base_moment"),
     ],

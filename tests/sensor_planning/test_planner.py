@@ -261,4 +261,4 @@ def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:
         return BaseObservability((True,), "sole", random, zero, None, None, ())
 
     (line,) = describe_singular_postures([checked(1e-3), checked(1e-8)])
-    assert "in 1 of 2 contact states" in line
+    assert "In 1 of 2 contact states" in line
