@@ -38,7 +38,7 @@ def test_the_feet_of_a_real_quadruped_roll_on_their_spheres(frame: str, radius: 
 @pytest.mark.parametrize(
     ("urdf", "frame", "radius", "centre", "text"),
     [
-        ("anymal.urdf", "LF_FOOT", 0.031, (0.0, 0.0, 0.02325), "31 mm, centre [0, 0, 23] mm, from the collision sphere"),
+        ("anymal.urdf", "LF_FOOT", 0.031, (0.0, 0.0, 0.02325), "31 mm, centre [0, 0, 23] mm, from the collision"),
         ("anymal-kinova.urdf", "RH_FOOT", 0.031, (0.0, 0.0, 0.02325), "31 mm, centre [0, 0, 23] mm, from"),
         ("go2.urdf", "FL_foot", 0.022, (-0.002, 0.0, 0.0), "centre [-2.1, 0.1, -0.24] mm, from the mesh foot_convex"),
         ("solo12.urdf", "FL_FOOT", 0.016, (0.0, 0.0, 0.0), "from the mesh solo_foot.stl"),
