@@ -25,6 +25,7 @@ from bags import (
     vector,
     wrench,
 )
+from motions import value
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import TorchidWarning
@@ -206,6 +207,15 @@ def test_wrenches_are_the_environments_and_the_parents_action_unless_a_sign_says
     assert log.ft_wrench is not None
     np.testing.assert_array_equal(log.contact_wrench_local[:, 0], [-values] * 4)
     np.testing.assert_array_equal(log.ft_wrench[:, 0], [values] * 4)
+
+
+def test_a_signalling_nan_is_a_value_that_was_not_measured(tmp_path: Path) -> None:
+    values = np.arange(1.0, 7.0)
+    values[3] = np.array(0x7FF0_0000_0000_0001).view(np.float64)
+    entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, values, "sole")) for s in map(int, STAMPS)]
+    topics = {"contact_wrenches": {"sole": {"topic": "/w", "sign": -1}}}
+    log = read_messages(tmp_path / "x.bag", entries, **topics, contact_force_threshold=1.0)
+    np.testing.assert_array_equal(value(log.contact_wrench_local)[:, 0], [[-1, -2, -3, np.nan, -5, -6]] * 4)
 
 
 def test_a_limbs_wrench_is_in_the_child_frame_if_the_map_names_it_and_else_warned_of(tmp_path: Path) -> None:

@@ -259,6 +259,7 @@ class _Messages:
         """The messages with one layout of arrays."""
         rows = self.rows[layout]
         values = np.array(rows.values, dtype=np.float64).reshape(len(rows.stamps), -1)
+        values[np.isnan(values)] = np.nan  # signalling ones warn in the first operation
         split = np.split(values, np.cumsum(layout[1])[:-1], axis=1)
         stamps, received = (np.array(x, dtype=np.int64) for x in (rows.stamps, rows.received))
         return _Parts(stamps, received, dict(zip(_PATHS[self.type], split, strict=True)))
