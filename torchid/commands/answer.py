@@ -221,7 +221,7 @@ def _bodies_text(run: Results) -> str:
             return f"physically consistent, but MuJoCo refuses joints that move no mass: {join_names(ends)}"
         if run.refused:
             return f"all {count} physically consistent, but MuJoCo refuses the file: {run.refused}"
-        return f"all {count} physically consistent; valid in MuJoCo"
+        return f"all {count} physically consistent"
     bodies = {violation.body for violation in run.violations} - {None}
     which = f"{len(bodies)} of {count}" if bodies else "all together"
     advice = ". Use estimator.name=consistent" if type(run.estimate) is Estimate else ""

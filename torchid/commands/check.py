@@ -206,7 +206,7 @@ def _segment_name(path: Path, segment: slice, samples: int) -> str:
     name = log_title(path)
     if segment.stop - segment.start == samples:
         return name
-    return f"{name} (samples {segment.start} to {segment.stop - 1} of {samples}, numbered from there)"
+    return f"{name} (samples {segment.start} to {segment.stop - 1} of {samples}, counted from {segment.start})"
 
 
 def _require_memory(path: Path, settings: PreprocessingConfig) -> None:

@@ -21,6 +21,7 @@ from torchid.problem import LinearProblem
 EQUAL_WITHIN = 1e-9
 """Numbers closer than this share of their scale count as equal."""
 
+_FEASIBLE = "conditions that can all be met together"
 _SEARCH_RADIUS = 1e3
 """Radius, in scales of the parameters, within which a gap is valid along directions that the data do not determine."""
 
@@ -197,9 +198,6 @@ class ConicProblem:
         return out
 
 
-_FEASIBLE = "conditions that can all be met together"
-
-
 def _reduced(rows: list[LinearCondition], count: int) -> tuple[Array, Array]:
     """Equalities on x (count,) as E x = e, in as few orthonormal rows as they have rank, and their right-hand sides.
 
@@ -213,8 +211,7 @@ def _reduced(rows: list[LinearCondition], count: int) -> tuple[Array, Array]:
     off = np.abs(e - U[:, kept] @ (U[:, kept].T @ e)) > EQUAL_WITHIN * (1.0 + np.abs(e).max(initial=0.0))
     if off.any():
         names = ", ".join(dict.fromkeys(row.name for row, wrong in zip(rows, off, strict=True) if wrong))
-        reason = "contradicts the fixed parameters or other equality constraints"
-        raise InputError("estimator", names, reason, _FEASIBLE)
+        raise InputError("estimator", names, "contradicts fixed parameters or other equality constraints", _FEASIBLE)
     return right[kept], (U[:, kept].T @ e) / values[kept]
 
 
@@ -236,17 +233,15 @@ def _without_implied(rows: list[LinearCondition], E: Array, e: Array) -> list[Li
 
 Prior = Literal["euclidean", "pullback", "entropic"]
 
-# shares of the mean square of the data, of the ridge
-_FLOOR_OF_DATA = 1e-8
-_FLOOR_OF_RIDGE = 1e-3
+_FLOOR_OF_DATA = 1e-8  # fraction of the mean square of the data
+_FLOOR_OF_RIDGE = 1e-3  # fraction of the ridge
 
 
 class _Scaled:
     """Parameters and terms in scaled units: `start + slopes @ x`.
 
     Attributes:
-        start: (12 L + M,).
-        slopes: (12 L + M, n), zero rows for fixed parameters.
+        start, slopes: (12 L + M,) and (12 L + M, n), zero rows for fixed parameters.
         deviations: (n, n), the other rows.
         place: (L, 12) int, entry of x of each free parameter.
         bodies: bodies with free inertia.

@@ -587,7 +587,7 @@ def check_rest(log: Log) -> Iterator[Finding]:
         names = [log.joint_names[joint] for joint in order]
         named = join_names([f"{name} {100.0 * share[joint]:.0f} %" for name, joint in zip(names, order, strict=True)])
         text = f"joints rest much of the time: {named}. At rest, friction has any value up to Coulomb friction"
-        advice = "nothing with actuators.stiction: auto or true, which exclude them; or record no pauses"
+        advice = "nothing if actuators.stiction is auto or true: it excludes these samples"
         yield Finding("rest", NOTE, "joint_position", text, advice, tuple(names))
 
 
