@@ -22,8 +22,8 @@ test test-oldest-mujoco test-fast coverage: export OMP_NUM_THREADS = 1
 test test-oldest-mujoco test-fast coverage: export PYTHONDONTWRITEBYTECODE =
 
 test: .venv/ready-for-tests
-	.venv/bin/ruff check torchid scripts tests
-	.venv/bin/ruff format --check torchid scripts tests
+	.venv/bin/ruff check setup.py torchid scripts tests
+	.venv/bin/ruff format --check setup.py torchid scripts tests
 	.venv/bin/mypy
 	.venv/bin/lint-imports
 	.venv/bin/pytest -n auto --dist loadfile
@@ -45,7 +45,7 @@ site: .venv/ready-for-tests
 clean:
 	rm -rf .venv .coverage
 
-.venv/ready: pyproject.toml constraints.txt
+.venv/ready: pyproject.toml constraints.txt setup.py $(wildcard torchid/kernels/*.cpp torchid/kernels/*.h)
 	$(PYTHON) -m venv .venv
 	$(PIP) install -q -c constraints.txt torch
 	$(PIP) install -q -c constraints.txt -e '.[tables]'
