@@ -7,7 +7,6 @@ start from the arrays of a log and end with parameters. Sensors are `joints` (to
 feet are in contact in two thirds of the samples. Consistent parameters are timed on noisy data of Solo12 that were
 generated with other, physically consistent parameters.
 
-As many samples as the default use the compiled kernels of the extra `[fast]` where Numba is installed, 65,536 do not.
 With `--device cuda` torchid's part runs on a GPU, the per-sample pipelines on the CPU as ever. A second table has the
 stages of the compression beside their floors, see `scripts/stages.py`.
 """
@@ -35,7 +34,6 @@ from torchid.errors import TorchidWarning, how_to_install
 from torchid.estimators import Consistent, LeastSquares
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.chunks import choose_kernels
 from torchid.problem.motion import BaseMotion
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
@@ -43,7 +41,7 @@ from torchid.sensing import Contact, SensorNoise, named_sensors
 
 _CPU = torch.device("cpu")
 _PAUSE = 0.1  # seconds before each time that is taken: OpenBLAS' threads spin for some 30 ms after their last product
-_STAGED = 65536  # samples whose stages are timed: so few that torch works on them, see `choose_kernels`
+_STAGED = 65536  # samples whose stages are timed
 _DENSE = 16384  # samples whose whole regressor a GPU has at a time: 1.7 GB of G1
 _FEW = 2048  # samples that the per-sample pipelines are timed with
 
@@ -281,7 +279,6 @@ def measure(
         "torchid": (bench.fit, count),
     }
     measured, by_stages = medians(pipelines, repeats, device), samples[torch.arange(0, count, max(1, count // _STAGED))]
-    choose_kernels(builder, len(by_stages))
     return measured, measure_stages(builder, by_stages, limits)
 
 

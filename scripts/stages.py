@@ -11,11 +11,12 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from unittest.mock import patch
 
 import torch
 from rich.table import Table
 
-from torchid import parameters
+from torchid import kernels, parameters
 from torchid.parallel import one_thread
 from torchid.problem import RowBuilder, Samples, compress
 from torchid.problem.chunks import chunk_size, chunks_by_state
@@ -103,11 +104,12 @@ class Stages:
 def measure_stages(builder: RowBuilder, samples: Samples, limits: Limits) -> Stages:
     """Measure one pass over some samples, on a CPU with one thread.
 
-    Stages follow each other through the same calls as in a fit; the later ones are differences of longer passes.
+    Stages follow each other through the same calls as in a fit without kernels, which do several stages at once; the
+    later ones are differences of longer passes.
     """
     device = builder.device
     size = chunk_size(device)
-    with torch.no_grad(), one_thread():
+    with torch.no_grad(), one_thread(), patch.object(kernels, "compiled", return_value=None):
         chunks = [(samples[index].to(device), state) for state, index in chunks_by_state(samples, size)]
         kinematics = [(state, builder.kinematics(chunk)) for chunk, state in chunks]
         workspace = Workspace()

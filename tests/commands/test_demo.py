@@ -23,7 +23,7 @@ from torchid.config import inputs_of, load_analysis, load_config, load_simulatio
 WITHOUT_EXTRAS = """
 import sys
 
-extras = ["h5py", "pyarrow", "rosbags", "mcap", "lz4", "zstandard", "mujoco", "numba"]
+extras = ["h5py", "pyarrow", "rosbags", "mcap", "lz4", "zstandard", "mujoco"]
 sys.modules.update(dict.fromkeys(extras))
 from torchid.cli import main
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,21 +15,18 @@ from random_samples import NOISE, random_samples, sensor_set
 from synthetic import PANDA, TALOS, TALOS_FULL, load
 
 import torchid
-from torchid.kernels import compiling_announced
-from torchid.problem import RowBuilder, Samples, TriangularFactor, chunks, compress, compress_parts, row_compressor
+from torchid import kernels
+from torchid.problem import RowBuilder, Samples, TriangularFactor, compress, compress_parts, row_compressor
 from torchid.problem.chunks import choose_kernels, chunks_by_state
+from torchid.problem.compiled_rows import CompiledChunk
 from torchid.problem.extras import ExtraTerms
 from torchid.problem.rows import Workspace
-
-numba = pytest.importorskip("numba", reason="compiled kernels need Numba, of the extra [fast]")
-kernels = pytest.importorskip("torchid.kernels.gram")
-compiled_rows = pytest.importorskip("torchid.problem.compiled_rows")
-tiles = pytest.importorskip("torchid.kernels.tiles")
 
 QUADRUPED = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 POINTS = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
 SOLES = [torchid.Contact(f"{side}_sole_link", "flat") for side in ("left", "right")]
-ENOUGH = 10**9  # samples of a pass for which kernels are used
+MANY = 10**9  # samples
+pytestmark = pytest.mark.skipif(kernels.compiled() is None, reason=kernels.why_not_compiled())
 
 
 def builders(
@@ -38,35 +34,22 @@ def builders(
 ) -> list[RowBuilder]:
     """With torch's operators, and with kernels."""
     plain, fast = (RowBuilder(robot, contacts, sensors, terms) for _ in range(2))
-    choose_kernels(fast, ENOUGH)
+    choose_kernels(fast, MANY)
     assert fast.compiled is not None
     return [plain, fast]
-
-
-def test_the_compiling_of_a_kernel_is_announced_and_nothing_else() -> None:
-    """Once, whoever it calls; not where it is there already, nor of functions of others."""
-    announced = list[str]()
-
-    @contextmanager
-    def announce() -> Iterator[None]:
-        announced.append("begins")
-        yield
-        announced.append("ends")
-
-    anew, other = numba.njit(tiles.turn.py_func), numba.njit(lambda x: x + 1.0)
-    tile = np.arange(9.0).repeat(tiles.TILE)
-    with compiling_announced(announce):
-        first = anew(tile, 0, (1.0, 2.0, 3.0))
-        assert announced == ["begins", "ends"]
-        assert (anew(tile, 0, (1.0, 2.0, 3.0)), other(1.0)) == (first, 2.0)
-    numba.njit(tiles.dot.py_func)((1.0, 2.0, 3.0), (1.0, 2.0, 3.0))
-    assert announced == ["begins", "ends"]
 
 
 def by_axis(sensors: torchid.SensorSet) -> torchid.SensorSet:
     """With noise of the base that differs from axis to axis of the levelled base."""
     noise = replace(sensors.noise, base_force=(0.3, 2.0, 0.9), base_moment=(0.2, 0.03, 0.08))
     return replace(sensors, noise=noise)
+
+
+@contextmanager
+def without_kernels() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, "compiled", lambda: None)
+        yield
 
 
 def assert_same_rows(plain: RowBuilder, fast: RowBuilder, samples: Samples) -> int:
@@ -128,8 +111,9 @@ def test_gram_matrices_are_those_of_numpy(columns: int, rows: int, lower: int) -
     chosen = np.sort(rng.permutation(columns)[:lower])
     changed, expected = X.copy(), X.copy()
     (gram, squares), (reference, before) = ((np.full((columns, columns), np.nan), np.full(lower, np.nan)) for _ in "ab")
-    kernels.write_gram(changed, columns, chosen, combination, squares, gram)
-    row_compressor.write_gram(expected, columns, chosen, combination, before, reference)
+    row_compressor.write_gram(changed, columns, chosen, combination, squares, gram)
+    with without_kernels():
+        row_compressor.write_gram(expected, columns, chosen, combination, before, reference)
     np.testing.assert_array_equal(changed[:, :columns], X[:, :columns])
     np.testing.assert_allclose(changed, expected, rtol=0.0, atol=1e-13)
     np.testing.assert_allclose(squares, before, rtol=1e-13)
@@ -151,15 +135,15 @@ def test_rows_that_are_multiplied_at_once_give_the_same_factor(
     monkeypatch.setattr(row_compressor, "_MOST_COMBINED", 1.0)
     plain, fast = builders(robot, contacts, sensor_set(sensors, robot, contacts))
     samples = random_samples(robot, contacts, 2500, 4, states=1)[0]
-    expected = compress_parts([samples], plain, chunk=700, threads=1)
-    multiplied, grams = list[int](), compiled_rows.CompiledChunk.grams
+    with without_kernels():
+        expected = compress_parts([samples], plain, chunk=700, threads=1)
+    multiplied, grams = list[int](), CompiledChunk.grams
 
     def counted(*args: Any) -> Iterator[object]:
         multiplied.append(len(made := list(grams(*args))))
         return iter(made)
 
-    monkeypatch.setattr(compiled_rows.CompiledChunk, "grams", counted)
-    monkeypatch.setattr(chunks, "_WORTH_LOADING", 0)
+    monkeypatch.setattr(CompiledChunk, "grams", counted)
     found = compress_parts([samples], fast, chunk=700, threads=1)
     assert multiplied[0] == 0 < multiplied[1] == multiplied[2] == multiplied[3]
     assert_same_factors(found[0].factor, expected[0].factor)
@@ -176,7 +160,6 @@ def test_rows_unlike_those_before_are_made_again_and_factorized(monkeypatch: pyt
     }
     base = {name: getattr(samples.base, name) * still for name in ("angular_velocity", "angular_acceleration")}
     samples = replace(samples, base=replace(samples.base, **base), **motion)
-    monkeypatch.setattr(chunks, "_WORTH_LOADING", 0)
     refused, add_gram = list[bool](), row_compressor.RowCompressor.add_gram
 
     def counted(*args: object) -> bool:
@@ -184,7 +167,8 @@ def test_rows_unlike_those_before_are_made_again_and_factorized(monkeypatch: pyt
         return added
 
     monkeypatch.setattr(row_compressor.RowCompressor, "add_gram", counted)
-    expected = compress_parts([samples], plain, chunk=3000, threads=1)
+    with without_kernels():
+        expected = compress_parts([samples], plain, chunk=3000, threads=1)
     found = compress_parts([samples], fast, chunk=3000, threads=1)
     assert any(refused)
     assert_same_factors(found[0].factor, expected[0].factor)
@@ -199,7 +183,7 @@ def test_extra_parameters_of_joints_are_in_the_rows(sensors: str) -> None:
     assert assert_same_rows(plain, fast, samples) == len(list(chunks_by_state(samples)))
     of_contacts = ExtraTerms(offsets={"contact_force": "all"})
     other = RowBuilder(QUADRUPED, POINTS, sensor_set(sensors, QUADRUPED, POINTS), of_contacts)
-    choose_kernels(other, ENOUGH)
+    choose_kernels(other, MANY)
     assert (other.compiled is None) == bool(other.extras), "torch's"
 
 
@@ -216,23 +200,17 @@ def test_straight_knees_are_no_exception(
     assert assert_same_rows(plain, fast, samples) == 1
 
 
-def test_a_numba_that_does_not_work_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    builder = RowBuilder(QUADRUPED, POINTS, sensor_set("joints", QUADRUPED, POINTS))
-    monkeypatch.setitem(sys.modules, "torchid.problem.compiled_rows", None)  # importing it then fails
-    with pytest.warns(torchid.errors.TorchidWarning, match=r"Numba does not load \(.* without it"):
-        choose_kernels(builder, ENOUGH)
-    assert builder.compiled is None
-
-
-def test_long_passes_use_kernels_and_give_the_same_factor(monkeypatch: pytest.MonkeyPatch) -> None:
-    sensors = sensor_set("joints", QUADRUPED, POINTS)
-    builder = RowBuilder(QUADRUPED, POINTS, sensors)
+@pytest.mark.parametrize("sensors", ["joints", "full"])
+def test_fits_without_the_library_are_the_same(sensors: str) -> None:
+    builder = RowBuilder(QUADRUPED, POINTS, sensor_set(sensors, QUADRUPED, POINTS))
     samples = random_samples(QUADRUPED, POINTS, 5000, 7, states=2)[0]
-    expected = compress([samples], builder).triangle()
-    assert builder.compiled is None, "too few samples"
-    monkeypatch.setattr(chunks, "_WORTH_LOADING", len(samples))
     found = compress([samples], builder).triangle()
     assert builder.compiled is not None
+    with without_kernels():
+        expected = compress([samples], builder).triangle()
+        assert builder.compiled is None
+        with pytest.warns(torchid.errors.TorchidWarning, match="compression takes twice as long"):
+            choose_kernels(builder, MANY)
     assert_same_grams(found, expected)
 
 

@@ -48,7 +48,7 @@ def fits(*counts: int) -> list[dict[str, float]]:
 
 
 def test_five_times_the_samples_need_no_more_memory_beside_their_arrays() -> None:
-    short, long = fits(38_000, 190_000)  # both in chunks of the largest size, and without Numba, which takes 90 MB
+    short, long = fits(38_000, 190_000)  # both in chunks of the largest size
     assert long["all"] - long["arrays"] < short["all"] - short["arrays"] + 80.0  # allocators keep some slack
 
 

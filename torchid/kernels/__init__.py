@@ -1,45 +1,50 @@
-"""Kernels for the rows of a chunk, compiled by Numba (extra `[fast]`): what they work on stays in a processor's caches.
+"""Kernels in C++ for fits and modules: compiled when torchid is installed, called through `ctypes`.
 
-Importing a module of this package compiles its kernels, or loads what Numba has kept of them on disk. It compiles anew
-when the kernel's own module has changed, but not for a change of others: whoever edits one of them deletes the
-`*.nbi` and `*.nbc` in `__pycache__`.
+Rows of fits: `limbs.cpp`, `rows.cpp` and `gram.cpp`, called by `torchid.problem.compiled_rows`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from ctypes import CDLL, c_uint
+from ctypes import CDLL, c_double, c_int64, c_uint
 from functools import cache
 from pathlib import Path
+from typing import Any
 from zlib import crc32
 
-_announcers: list[Callable[[], AbstractContextManager[object]]] = []
+import numpy as np
+from torch import Tensor
 
-
-@contextmanager
-def compiling_announced(announce: Callable[[], AbstractContextManager[object]]) -> Iterator[None]:
-    """Enter what `announce` returns while kernels are compiled, not where Numba has kept them on disk."""
-    _announcers.append(announce)
-    try:
-        yield
-    finally:
-        _announcers.remove(announce)
-
-
-def announced() -> AbstractContextManager[object]:
-    """What is to be entered while a kernel is compiled."""
-    return _announcers[-1]() if _announcers else nullcontext()
+Word = Tensor | np.ndarray | int
 
 
 def compiled() -> CDLL | None:
-    """The library of the C++ kernels; None where it is missing, see `why_not_compiled`. Calls release Python's lock."""
+    """The library of the kernels; None where it is missing, see `why_not_compiled`. Calls release Python's lock."""
     return _load()[0]
 
 
 def why_not_compiled() -> str:
     """Why `compiled` is None, and what to do, in one line."""
     return _load()[1]
+
+
+def call(name: str, *arguments: Word | tuple[Word, ...] | float) -> None:
+    """Call a kernel with contiguous arrays, integers, floats, and tuples of arrays and integers for structures."""
+    getattr(compiled(), name)(*map(_converted, arguments))
+
+
+def _converted(argument: Word | tuple[Word, ...] | float) -> Any:
+    if isinstance(argument, tuple):
+        return (c_int64 * len(argument))(*map(_word, argument))
+    return c_double(argument) if isinstance(argument, float) else c_int64(_word(argument))
+
+
+def _word(value: Word) -> int:
+    """An integer, or the address of an array."""
+    if isinstance(value, int):
+        return value
+    if not (value.is_contiguous() if isinstance(value, Tensor) else value.flags.c_contiguous):
+        raise ValueError("expected a contiguous array")
+    return value.data_ptr() if isinstance(value, Tensor) else value.ctypes.data
 
 
 @cache

@@ -38,7 +38,9 @@ template <class T> inline V<T> fill(T x) { return V<T>{} + x; }
 
 // The sum of all lanes, always in the same order.
 template <class T> inline T sum(const V<T> &v) {
-    T total = v[0];
-    for (long k = 1; k < LANES<T>; ++k) total += v[k];
-    return total;
+    T x[LANES<T>];
+    std::memcpy(x, &v, sizeof v);
+    for (long half = LANES<T> / 2; half > 0; half /= 2)
+        for (long k = 0; k < half; ++k) x[k] += x[k + half];
+    return x[0];
 }

@@ -6,16 +6,16 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from itertools import chain, islice, pairwise
 from typing import TypeVar
 
 import numpy as np
 import torch
 
-from torchid import distributed
-from torchid.errors import excerpt, warn
+from torchid import distributed, kernels
+from torchid.errors import warn
 from torchid.parallel import run_in_workers, thread_count
+from torchid.problem.compiled_rows import CompiledRows
 from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
@@ -33,7 +33,7 @@ CHUNK = 4096
 _LEAST = 2048  # samples per chunk where there are fewer than `_EACH` chunks for each worker
 _EACH = 4
 _LET_GO = 4  # chunks of a worker, after which it releases the mapped pages of the samples
-_WORTH_LOADING = 200_000  # samples: kernels take 0.4 s to load and save 2.6 to 6 us per sample on two cores
+_MANY = 200_000  # samples, for which kernels save a second
 _MOST_ON_GPU = 64 * CHUNK  # samples per chunk: a launch takes the host 12 ms for any size
 _SHARE_OF_GPU = 8  # a chunk takes at most this fraction (1 / 8) of a GPU's memory
 _ON_GPU = 48 * 2**10  # bytes of a sample
@@ -85,24 +85,20 @@ def map_chunks(
 
 
 def choose_kernels(builder: RowBuilder, samples: int) -> None:
-    """Let a builder use compiled kernels for this many samples, if they are faster and available; otherwise torch.
+    """Let a builder use compiled kernels where they are available; otherwise torch.
 
-    Torch handles extra parameters of contact sensors, and task weights. Kernels need Numba (extra `[fast]`) that suits
-    the installed NumPy, and a folder for its cache.
+    Torch handles extra parameters of contact sensors, and task weights.
 
     Warns:
-        TorchidWarning: Numba is installed but the kernels do not load.
+        TorchidWarning: The kernels are missing, and so many samples would be faster with them.
     """
     plain = builder.device.type == "cpu" and builder.tree.ancestors.dtype == torch.float64
     plain = plain and builder.task_weights is None and not any(extra.contacts for extra in builder.extras)
-    if not plain or samples < _WORTH_LOADING or find_spec("numba") is None:
+    if plain and kernels.compiled() is None and samples >= _MANY:
+        warn(f"compression takes twice as long: {kernels.why_not_compiled()}")
+    if not plain or kernels.compiled() is None:
         builder.compiled = None
     elif builder.compiled is None:
-        try:
-            from torchid.problem.compiled_rows import CompiledRows  # slow to import, and not needed for short logs
-        except (ImportError, RuntimeError) as error:
-            warn(f"Numba does not load ({excerpt(str(error))}). Compression runs without it and takes twice as long")
-            return
         builder.compiled = CompiledRows(builder)
 
 

@@ -22,7 +22,7 @@ from torchid.problem.chunks import (
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.noise_gram import NoiseGram, PartKey, estimate_noise_gram
-from torchid.problem.row_compressor import RowCompressor, RowWeighting, write_gram
+from torchid.problem.row_compressor import RowCompressor, RowWeighting
 from torchid.problem.rows import BlockRows, RowBuilder, Workspace
 from torchid.problem.samples import Samples
 from torchid.problem.unloaded_sensors import unloaded_offset_equations
@@ -299,8 +299,7 @@ def _begin_blocks(
         if key not in parts:
             parts[key] = Part(key.source, key.state, TriangularFactor(builder.width), 0, key.fold, key.block)
         if key not in compressors:
-            writer = write_gram if builder.compiled is None else builder.compiled.write_gram
-            compressors[key] = RowCompressor(parts[key].factor, writer)
+            compressors[key] = RowCompressor(parts[key].factor)
         parts[key].samples += end - start
 
 

@@ -12,6 +12,7 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
+from torchid import kernels
 from torchid.parameters import Array
 from torchid.problem.linear import TriangularFactor, triangularize
 from torchid.problem.samples import Samples
@@ -42,19 +43,23 @@ _MOST_COMBINED = 0.5  # of the columns: where more are combined, QR is as fast, 
 _LEAST_ROWS = 2000  # of a chunk that columns are combined for: of fewer, that takes longer than Householder QR of them
 
 
-class GramWriter(Protocol):
-    """Replaces columns by combinations of all, and multiplies: `write_gram`, or its namesake in `torchid.kernels`."""
-
-    def __call__(
-        self, columns: Array, first: int, lower: np.ndarray, combination: Array, squares: Array, gram: Array, /
-    ) -> None:
-        """See `torchid.kernels.gram.write_gram`."""
-
-
 def write_gram(
     columns: Array, first: int, lower: np.ndarray, combination: Array, squares: Array, gram: Array, /
 ) -> None:
-    """What the kernel of this name does, by NumPy."""
+    """Replace some columns by combinations of all, and write the Gram matrix of the columns then.
+
+    Args:
+        columns: (n, first + M), contiguous, the rows by column; those before the first are left alone.
+        first: number of these.
+        lower: (k,), columns that are replaced.
+        combination: (k, n), by what.
+        squares: (k,), written: sums of squares of these columns before.
+        gram: (n, n), written.
+    """
+    if kernels.compiled() is not None:
+        n, stop = columns.shape
+        kernels.call("write_gram", columns, n, first, stop - first, len(lower), lower, combination, squares, gram)
+        return
     X = columns[:, first:]
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite stays so
         if len(lower):
@@ -108,7 +113,7 @@ class ColumnLevels:
         inverse = np.linalg.solve(self.T_unit, np.eye(len(self.size))[:, self.lower])
         return np.asarray(inverse * self.size[self.lower] / self.size[:, None])
 
-    def apply(self, columns: Array, first: int, write_gram: GramWriter) -> Array | None:
+    def apply(self, columns: Array, first: int) -> Array | None:
         """Change columns in place; return their Gram matrix, (n, n), or None if they were not changed.
 
         They are not changed if one would become much longer. The rows then differ from those of the levels, and a
@@ -117,7 +122,6 @@ class ColumnLevels:
         Args:
             columns: (n, first + M), rows by column, contiguous.
             first: number of rows to skip.
-            write_gram: changes the columns and multiplies.
         """
         gram = np.empty_like(self.T_unit)
         squares = np.empty(len(self.lower))
@@ -251,10 +255,9 @@ class RowCompressor:
     combined again. Few rows, and rows on a GPU or in single precision, are always factorized.
     """
 
-    def __init__(self, factor: TriangularFactor, write_gram: GramWriter = write_gram) -> None:
-        """Add rows to a factor; `write_gram`: NumPy's way, or a compiled one."""
+    def __init__(self, factor: TriangularFactor) -> None:
+        """Add rows to a factor."""
         self.factor = factor
-        self._write_gram = write_gram
         self._levels: dict[tuple[int, ...], ColumnLevels] = {}
         self._sums: dict[tuple[int, ...], _Sum] = {}
 
@@ -278,7 +281,7 @@ class RowCompressor:
         if known is None:
             self.factor.add_in_place(support, stacked, oversampling)
             return
-        gram = known.levels.apply(columns.numpy(), room, self._write_gram)
+        gram = known.levels.apply(columns.numpy(), room)
         if gram is not None and known.add(gram):
             self._sums[support] = known
         else:
@@ -291,7 +294,7 @@ class RowCompressor:
         return None if known is None else known.levels
 
     def add_gram(self, support: tuple[int, ...], squares: Array, gram: Array, count: int, oversampling: float) -> bool:
-        """Add a Gram matrix from `GramWriter`, if it is accurate.
+        """Add a Gram matrix from `write_gram`, if it is accurate.
 
         Returns:
             Whether it was added; otherwise give the rows to `add`.
@@ -331,7 +334,7 @@ class RowCompressor:
         if np.isfinite(R).all():
             anew = _Sum.zeros(ColumnLevels.of(R))
             self._levels[support] = anew.levels
-            gram = anew.levels.apply(R.T.copy(), 0, self._write_gram)
+            gram = anew.levels.apply(R.T.copy(), 0)
             if gram is not None and anew.add(gram):
                 self._sums[support] = anew
                 return

@@ -36,7 +36,7 @@ from torchid.problem.extras import (
 )
 from torchid.problem.motion import levelled_base_axes
 from torchid.problem.null_bases import ContactRows, spread_columns, whitened_bases
-from torchid.problem.row_compressor import ColumnLevels, GramWriter
+from torchid.problem.row_compressor import ColumnLevels
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import all_wrench_columns
 from torchid.regressor.kinematics import BodyStates, JointMotion, body_states, joint_motion, joint_screw_axes
@@ -179,15 +179,11 @@ class KernelRows(Protocol):
     def grams(
         self, levels: Callable[[tuple[int, ...]], ColumnLevels | None]
     ) -> Iterator[tuple[RowBlock, Array, Array]]:
-        """Blocks with squares and Gram matrices as `GramWriter` writes them."""
+        """Blocks with squares and Gram matrices as `write_gram` of `torchid.problem.row_compressor` writes them."""
 
 
 class Kernels(Protocol):
     """Compiled kernels of a builder, see `torchid.problem.compiled_rows.CompiledRows`."""
-
-    @property
-    def write_gram(self) -> GramWriter:
-        """The kernel that multiplies rows."""
 
     def chunk(self, samples: Samples, layout: ContactStateLayout, workspace: Workspace) -> KernelRows | None:
         """The rows of a chunk; None where kernels cannot make them."""

@@ -6,8 +6,7 @@ import io
 import math
 import os
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from textwrap import wrap
 from typing import Any
 
@@ -26,7 +25,6 @@ from torchid.fitting.fit import Comparison
 from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.information import Contribution, Contributions, PartContribution
-from torchid.kernels import compiling_announced
 from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
@@ -300,11 +298,7 @@ def _extra_cell(extra: ExtraEstimate) -> str:
     return f"{extra.value:.{digits}f} ± {size:.{digits}f}{mark}"
 
 
-COMPILING = "compiling kernels, once on this machine (about 20 s)"
-
-
-@contextmanager
-def progress_bars() -> Iterator[Progress]:
+def progress_bars() -> Progress:
     """Progress bars that vanish at the end and are not shown where standard error is not a terminal."""
     console = terminal_console(stderr=True)
     columns = (
@@ -314,18 +308,7 @@ def progress_bars() -> Iterator[Progress]:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
-
-        @contextmanager
-        def compiling() -> Iterator[None]:
-            task = bars.add_task(COMPILING, total=None)
-            try:
-                yield
-            finally:
-                bars.remove_task(task)
-
-        with compiling_announced(compiling):
-            yield bars
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 LABEL = 14
