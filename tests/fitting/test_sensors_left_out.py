@@ -10,8 +10,9 @@ import pytest
 from synthetic import Oracle, make_log
 
 import torchid
-from torchid.fitting.left_out import leave_sensors_out
+from torchid.fitting.left_out import gain_deviations, leave_sensors_out
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
+from torchid.problem.compression import compress_parts
 from torchid.report.analysis import ALL_OF, contradicting_messages
 from torchid.sensing import SensorNoise, SensorSet, named_sensors
 
@@ -57,3 +58,17 @@ def test_the_foot_that_reads_too_much_is_found_and_no_other(terms: ExtraTerms) -
     clean = leave_sensors_out([walk(1.0)], fitter_of(terms), terms, sets)
     assert not any(one.adopted for one in clean.values())
     assert not contradicting_messages(clean)
+
+
+@pytest.mark.parametrize("scope", ["all", "log"])
+def test_errors_of_gains_move_parameters_where_scales_of_contact_forces_are_fitted(scope: str) -> None:
+    terms = ExtraTerms(scales={"contact_force": scope})
+    fitter = fitter_of(terms)
+    log = walk(1.0)
+    deviations = gain_deviations([log], fitter, terms, 0.01)
+    assert deviations.shape == (ROBOT.n, ROBOT.nominal.size)
+    before = fitter.fit(compress_parts([log], fitter.builder)).estimate.phi
+    gained = log.torque.clone()
+    gained[:, 1] *= 1.01
+    after = fitter.fit(compress_parts([replace(log, torque=gained)], fitter.builder)).estimate.phi
+    np.testing.assert_allclose(deviations[1], after - before, atol=0.01 * np.abs(after - before).max())

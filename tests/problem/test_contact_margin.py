@@ -10,9 +10,11 @@ import yaml
 from demo import shortened_demo
 from refusals import refusal
 from repository import DEMO
+from rich.progress import Progress
 from synthetic import SOLO12, Array, Oracle, load, make_log
 from true_robots import true_parameters
 
+from torchid.commands.chosen_settings import with_chosen_settings
 from torchid.config import load_config
 from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import set_up
@@ -26,8 +28,11 @@ PHASE, STEP, SLIP = 40, 0.01, 0.05  # samples of a phase, s, s
 STATES = [[True] * 4, [False, True, True, True], [True] * 4, [True, False, True, True]]
 
 
-def slipping(folder: Path, slip: float) -> tuple[Path, Array]:
-    """An experiment file whose log has a wrong torque of 20 N m within `slip` [s] of each change; true parameters."""
+def slipping(folder: Path, slip: float, gains: float = 0.0) -> tuple[Path, Array]:
+    """An experiment file whose log has a wrong torque of 20 N m within `slip` [s] of each change; true parameters.
+
+    `gains`: standard deviation of the gains of the torque sensors.
+    """
     robot, rng = load(SOLO12), np.random.default_rng(0)
     oracle = Oracle.of(robot)
     oracle.perturb(rng, 0.2)
@@ -37,6 +42,7 @@ def slipping(folder: Path, slip: float) -> tuple[Path, Array]:
     edges = STEP * (np.arange(PHASE, len(log), PHASE) - 0.5)
     near = (np.abs(log.time[:, None] - edges) <= slip).any(axis=1)
     log.joint_torque[near] += 20.0
+    log.joint_torque[:] *= 1.0 + gains * rng.normal(size=robot.n)
     write_log(log, folder / "steps.h5")
     contacts = [{"frame": foot, "type": "point", "radius": 0} for foot in FEET]
     settings = {
@@ -68,6 +74,18 @@ def test_slip_around_changes_of_contact_spoils_a_fit_unless_a_margin_covers_it(
     error = np.abs(estimate.phi - true)[known].max()
     assert known.sum() > 60
     assert error < 1e-7 if exact else error > 0.1
+
+
+@pytest.mark.parametrize("scales", ["{}", "{joint_torque: all}", "{joint_torque: log}"])
+def test_the_same_margin_is_chosen_whether_gains_are_fitted_or_not(tmp_path: Path, scales: str) -> None:
+    """With a free common gain all forces would shrink, and with them the errors at changes of contact."""
+    file, _ = slipping(tmp_path, SLIP, gains=0.1)
+    terms = "armature: false, torque_offset: false, delay: null, stiffness: false, asymmetric_coulomb: false"
+    settings = [f"actuators={{{terms}, stiction: false, sign_width: null}}", "preprocessing.contact_margin_s=auto"]
+    experiment = set_up(load_config(file, [*settings, f"sensors={{set: joints, scales: {scales}}}"]))
+    _, choices = with_chosen_settings(experiment, Progress(disable=True))
+    assert choices.contact_margin is not None
+    assert choices.contact_margin.value == 0.06, "the first that covers the slip"
 
 
 def test_a_margin_leaves_whole_phases_but_for_their_ends(tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ class Reading:
         spread: (width, P), deviations in the columns per unit of the prior.
         extras: of the last columns.
         gain: standard deviation of the gains of the torque sensors, about their mean, which a fit with "scale" among
-            its terms allows for; 0: scales are as free as other extra parameters.
+            its terms allows for; 0: scales are as free about their mean as other extra parameters.
     """
 
     grams: Array
@@ -95,22 +95,20 @@ class Reading:
     @cached_property
     def noise_variance(self) -> float:
         """Mean squared residual of the best fit with all terms, whatever rows are weighted with."""
-        terms = [k for k, extra in enumerate(self.extras) if not (self.gain and extra.what == "scale")]
+        terms = [k for k, extra in enumerate(self.extras) if not (self.gain and is_torque_gain(extra))]
         x = self._solve(self.grams.sum(0), 1e-9 * self.rows.sum(), terms)
         return max(float(x @ self.grams.sum(0) @ x), 0.0) / max(float(self.rows.sum()), 1.0)
 
     def _normal(self, gram: Array, weight: float, fitted: Collection[int]) -> tuple[Array, Array]:
         """What is fitted in the columns, (width, D), and the normal matrix with the weighted prior."""
         count = len(self.nominal) - len(self.extras)
+        gains = np.array([is_torque_gain(self.extras[number]) for number in fitted], dtype=bool)
         unit = np.zeros((len(self.nominal), len(fitted)))
         for k, number in enumerate(fitted):
-            unit[count + number, k] = self.extras[number].size
-        prior = np.repeat([weight, _WEAK * weight], [self.spread.shape[1], len(fitted)])
-        gains = np.array([bool(self.gain) and self.extras[number].what == "scale" for number in fitted], dtype=bool)
-        if gains.any():  # a common one means another mass of the robot
-            about_mean = np.eye(gains.sum()) - 1.0 / gains.sum()
-            unit[np.ix_(count + np.array([*fitted])[gains], gains)] = self.gain / _BODIES * about_mean
-            prior[self.spread.shape[1] :][gains] = weight
+            unit[count + number, k] = self.gain / _BODIES if self.gain and gains[k] else self.extras[number].size
+        if gains.any():  # a common one means another mass of the robot, and small forces have small errors
+            unit[:, gains] -= unit[:, gains].mean(axis=1, keepdims=True)
+        prior = weight * np.append(np.ones(self.spread.shape[1]), np.where(gains & bool(self.gain), 1.0, _WEAK))
         columns = np.hstack([self.spread, unit])
         normal = columns.T @ gram[:-1, :-1] @ columns
         normal[np.diag_indices_from(normal)] += prior + (np.finfo(float).eps * np.trace(normal) or 1.0)
@@ -123,8 +121,8 @@ class Reading:
         return np.append(self.nominal + columns @ np.linalg.solve(normal, right), -1.0)
 
     def by_scales(self, ridge: float) -> Array:
-        """Change of the bodies' parameters per unit of each scale of a sensor, (J, P), in units of the prior."""
-        scales = [k for k, extra in enumerate(self.extras) if extra.what == "scale"]
+        """Change of the bodies' parameters per unit of each gain of a torque sensor, (J, P), in units of the prior."""
+        scales = [k for k, extra in enumerate(self.extras) if is_torque_gain(extra)]
         others = [k for k in range(len(self.extras)) if k not in scales]
         gram = self.grams.sum(0)
         count = len(self.nominal) - len(self.extras)
@@ -194,6 +192,11 @@ def kind_of(extra: Extra) -> str:
     return "delay" if extra.what == SLOPE else extra.what
 
 
+def is_torque_gain(extra: Extra) -> bool:
+    """Whether an extra parameter is the gain of joint torque sensors."""
+    return extra.what == "scale" and not extra.component
+
+
 @one_thread()
 def compress_reading(
     logs: Sequence[Samples], edges: Mapping[str, Array], fitter: LogFitter, gain: float = 0.0
@@ -230,10 +233,11 @@ def compress_reading(
         nominal[number] = in_file[extra.what][extra.dof] if extra.what in in_file else 0.0
     spread[: builder.columns.count] = prior.spread[:, free] / PRIOR_DEVIATION
     oversampling = sum(map(len, logs)) / sum(len(log) / log.oversampling for log in logs)
-    of_logs = [k for k, extra in enumerate(builder.extras, builder.columns.count) if extra.per_log]
+    extras = dict(enumerate(builder.extras, builder.columns.count))
+    of_logs = [k for k, extra in extras.items() if extra.per_log and extra.what != "scale"]
     shared_columns = [k for k in range(builder.width) if k not in of_logs]
     grams = np.array([_eliminated(gram, of_logs, [*shared_columns, builder.width]) for gram in grams])
-    shared = tuple(extra for extra in builder.extras if not extra.per_log)
+    shared = tuple(extra for k, extra in extras.items() if k not in of_logs)
     return Reading(grams, rows, oversampling, nominal[shared_columns], spread[shared_columns], shared, gain)
 
 
