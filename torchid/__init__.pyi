@@ -114,6 +114,7 @@ from .problem.compression import (
 )
 from .regressor import (
     FrameJacobian,
+    InverseDynamics,
     LoopJacobian,
     Motion,
     Regressor,
@@ -156,6 +157,7 @@ __all__ = [
     "FactorFile",
     "FittedPosterior",
     "FrameJacobian",
+    "InverseDynamics",
     "JointNetworks",
     "LeastSquares",
     "LinearProblem",

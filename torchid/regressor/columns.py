@@ -92,6 +92,41 @@ def reduction_matrix(tree: KinematicTree) -> Array:
     return np.asarray(own_columns.reshape(layout.count, -1))
 
 
+def all_columns(tree: KinematicTree) -> tuple[list[tuple[int, ...]], Array, None]:
+    """Columns of K's nodes, (12,) each or (), the frames of their parameters, (L, 4, 4), and no regrouping."""
+    columns: list[tuple[int, ...]] = [()] * tree.n_nodes
+    for body, node in enumerate(tree.node_of):
+        columns[node] = tuple(range(parameters.PER_BODY * body, parameters.PER_BODY * (body + 1)))
+    return columns, tree.T_joint_link, None
+
+
+def regrouped_columns(tree: KinematicTree) -> tuple[list[tuple[int, ...]], Array, Tensor]:
+    """The same of `reduced_layout` with the joints' friction, -1 for parameters without a column, and the regrouping.
+
+    The latter, (columns, 12 L), makes parameters of these columns from those of all.
+    """
+    per_body = parameters.PER_BODY
+    inertial = parameters.INERTIAL.stop
+    kept_by_node = reduced_layout(tree).kept
+    regrouped = np.zeros((sum(map(len, kept_by_node)), len(tree.node_of), per_body))
+    regrouped[..., :inertial] = reduction_matrix(tree).reshape(len(regrouped), -1, inertial)
+    of_all = np.eye(per_body * len(tree.node_of))
+    columns = list[tuple[int, ...]]()
+    rows = list[Array]()
+    taken = 0
+    for node, kept in enumerate(kept_by_node):
+        moves = tree.kinds[node] in ("revolute", "prismatic")
+        numbers = [*kept, *range(inertial, per_body)] if moves else list(kept)
+        start = sum(map(len, rows))
+        at = {column: start + place for place, column in enumerate(numbers)}
+        columns.append(tuple(at.get(column, -1) for column in range(per_body)) if at else ())
+        friction = per_body * tree.body_of[node] + inertial
+        rows += [regrouped[taken : taken + len(kept)].reshape(len(kept), -1), of_all[friction : friction + 2 * moves]]
+        taken += len(kept)
+    frames = np.tile(np.eye(4), (tree.n_nodes, 1, 1))
+    return columns, frames, torch.from_numpy(np.concatenate(rows))
+
+
 def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | None = None) -> Tensor:
     """Wrench columns (6, columns, B) of all bodies.
 

@@ -60,10 +60,10 @@ def motion_from_state(
     """Compute the motion from generalized coordinates in Pinocchio's free-flyer layout.
 
     Args:
-        q: (B, 7 + n): base position in the world [m], base orientation as a quaternion x, y, z, w, joint positions
-            [rad or m]; (B, n) for a fixed base. The quaternion is normalized; norm 0 means no rotation.
-        v: (B, nv): base linear and angular velocity in the base frame [m/s, rad/s], then joint velocities.
-        a: (B, nv): time derivative of `v`.
+        q: (..., 7 + n): base position in the world [m], base orientation as a quaternion x, y, z, w, joint positions
+            [rad or m]; (..., n) for a fixed base. The quaternion is normalized; norm 0 means no rotation.
+        v: (..., nv): base linear and angular velocity in the base frame [m/s, rad/s], then joint velocities.
+        a: (..., nv): time derivative of `v`.
         n: number of independent joints.
         fixed_base: whether the base is fixed, with the axes of the world.
         gravity: (3,), in the world [m/s^2].
@@ -72,14 +72,8 @@ def motion_from_state(
         TypeError: `q`, `v` or `a` is not a tensor, or they are on different devices.
         ValueError: a shape is wrong.
     """
-    if wrong := [type(x).__name__ for x in (q, v, a) if not isinstance(x, Tensor)]:
-        raise TypeError(f"q, v, a: found {wrong[0]}; accepted: tensors")
-    width_q, width_v = (n, n) if fixed_base else (n + 7, n + 6)
-    if q.ndim != 2 or q.shape[1] != width_q or v.shape != (q.shape[0], width_v) or a.shape != v.shape:
-        shapes = ", ".join(str(tuple(x.shape)) for x in (q, v, a))
-        raise ValueError(f"q, v, a: found shapes {shapes}; accepted: (B, {width_q}), (B, {width_v}), (B, {width_v})")
-    if len(devices := {x.device: None for x in (q, v, a)}) > 1:
-        raise TypeError(f"q, v, a: found devices {', '.join(map(str, devices))}; accepted: one device")
+    require_state(q, v, a, n, fixed_base)
+    q, v, a = (x.reshape(-1, x.shape[-1]) for x in (q, v, a))
     g_world = q.new_tensor(gravity)
     if fixed_base:
         zero = q.new_zeros(q.shape[0], 3)
@@ -89,6 +83,21 @@ def motion_from_state(
     g_base = (rotation_matrix(q[:, 3:7]).mT @ g_world[:, None])[..., 0]
     specific_force = a[:, :3] + torch.linalg.cross(angular, linear) - g_base
     return Motion(q[:, 7:], v[:, 6:], a[:, 6:], angular, a[:, 3:6], specific_force)
+
+
+def require_state(q: Tensor, v: Tensor, a: Tensor, n: int, fixed_base: bool) -> None:
+    """Raise TypeError or ValueError if generalized coordinates do not fit together; see `motion_from_state`."""
+    if wrong := [type(x).__name__ for x in (q, v, a) if not isinstance(x, Tensor)]:
+        raise TypeError(f"q, v, a: found {wrong[0]}; accepted: tensors")
+    (width_q, width_v) = (n, n) if fixed_base else (n + 7, n + 6)
+    samples = q.shape[:-1]
+    if q.shape[-1:] != (width_q,) or v.shape != (*samples, width_v) or a.shape != v.shape:
+        shapes = ", ".join(str(tuple(x.shape)) for x in (q, v, a))
+        accepted = f"(..., {width_q}), (..., {width_v}), (..., {width_v})"
+        raise ValueError(f"q, v, a: found shapes {shapes}; accepted: {accepted}")
+    if not q.device == v.device == a.device:
+        devices = dict.fromkeys(str(x.device) for x in (q, v, a))
+        raise TypeError(f"q, v, a: found devices {', '.join(devices)}; accepted: one device")
 
 
 @dataclass(frozen=True)
@@ -182,7 +191,7 @@ def require_precision(tree: KinematicTree, tensors: Mapping[str, Tensor | None])
 
 
 def independent_positions(tree: KinematicTree, q: Tensor) -> Tensor:
-    """Positions (B, n) of the independent joints in coordinates (B, n + 7), or (B, n) for a fixed base.
+    """Positions (B, n) of the independent joints in coordinates (..., n + 7), or (..., n) for a fixed base.
 
     Raises:
         TypeError: `q` is not a tensor, or has another dtype or device than the module.
@@ -191,10 +200,10 @@ def independent_positions(tree: KinematicTree, q: Tensor) -> Tensor:
     width = tree.n + (7 if tree.base_rows else 0)
     if not isinstance(q, Tensor):
         raise TypeError(f"q: found {type(q).__name__}; accepted: a tensor")
-    if q.ndim != 2 or q.shape[1] != width:
-        raise ValueError(f"q: found shape {tuple(q.shape)}; accepted: (B, {width})")
+    if q.shape[-1:] != (width,):
+        raise ValueError(f"q: found shape {tuple(q.shape)}; accepted: (..., {width})")
     require_precision(tree, {"q": q})
-    return q[:, width - tree.n :]
+    return q.reshape(-1, width)[:, width - tree.n :]
 
 
 def states_at_rest(tree: KinematicTree, joint_position: Tensor) -> BodyStates:

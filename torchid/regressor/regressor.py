@@ -11,7 +11,16 @@ from torch import Tensor, nn
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.regressor.columns import ColumnLayout, all_wrench_columns, full_layout
+from torchid.regressor.columns import ColumnLayout, all_columns, all_wrench_columns, full_layout, regrouped_columns
+from torchid.regressor.compiled import (
+    Referenced,
+    call,
+    frame_jacobian,
+    inverse_dynamics,
+    regressor,
+    robot_tables,
+    write_regressor,
+)
 from torchid.regressor.kinematics import (
     GRAVITY_WORLD,
     BodyStates,
@@ -25,6 +34,7 @@ from torchid.regressor.kinematics import (
     link_states,
     motion_from_state,
     require_precision,
+    require_state,
     rotation_matrix,
     states_at_rest,
 )
@@ -32,20 +42,30 @@ from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 
 
-class Regressor(nn.Module):
+class Regressor(Referenced):
     """Regressor K(q, v, a) with `K phi = S^T tau + J_C^T lambda` (Mistry et al. 2009, eq. 5).
 
     Columns: 12 per body, bodies in the order of `robot.body_names`, parameters in the order of `torchid.parameters`.
     Rows: base force and base moment (base frame, about the base origin), then `robot.dof_names`: joint torques and
     wrenches of limb force/torque sensors. A fixed base has no base rows.
 
-    The module is differentiable, `.to(device, dtype)` moves it, and `torch.compile` and `torch.export` trace it as one
-    graph. `Regressor`, `FrameJacobian` and `torchid.Projection` are the reference implementation. Fits use the faster
-    `torchid.RowBuilder`, which never forms K (`tests/problem/test_rows_two_ways.py` compares both).
+    On a CPU, in float64 and float32, compiled kernels compute K and its gradient, where torchid was installed with a
+    C++ compiler. They are operators that `torch.compile`, `torch.export` and `torch.func` know. Elsewhere, and for
+    higher derivatives, torch's operators compute the same.
+
+    Attributes:
+        reduction: (columns, 12 L), None unless `regrouped`: `K_regrouped @ reduction` is K, and `reduction @ phi` are
+            the parameters of the columns.
     """
 
+    reduction: Tensor | None
+
     def __init__(
-        self, robot: Robot, gravity: tuple[float, float, float] = GRAVITY_WORLD, sign_width: float | None = None
+        self,
+        robot: Robot,
+        gravity: tuple[float, float, float] = GRAVITY_WORLD,
+        sign_width: float | None = None,
+        regrouped: bool = False,
     ) -> None:
         """Build the constants.
 
@@ -53,6 +73,8 @@ class Regressor(nn.Module):
             robot: the robot.
             gravity: (3,), in the world (in the base frame if the base is fixed) [m/s^2].
             sign_width: replaces the sign of Coulomb friction by tanh(velocity / sign_width) [rad/s or m/s].
+            regrouped: whether K has only the columns that remain after regrouping (Gautier 1990), and the friction of
+                joints. For a floating base these are base parameters.
         """
         super().__init__()
         self.gravity = gravity
@@ -60,29 +82,75 @@ class Regressor(nn.Module):
         self._inertial = full_layout(self.tree)
         self._columns = ColumnLayout((tuple(range(parameters.PER_BODY)),) * self.tree.n_nodes)
         self._rows = joint_rows(self.tree, self._columns)
+        columns, frames, reduction = (regrouped_columns if regrouped else all_columns)(self.tree)
+        self.shape = self.tree.n_rows, max((column + 1 for own in columns for column in own), default=0)
+        table, reals = robot_tables(self.tree, columns, frames, gravity)
+        for name, constants in (("reduction", reduction), ("table", table), ("reals", reals)):
+            self.register_buffer(name, constants, persistent=False)
 
-    def forward(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+    def forward(self, q: Tensor, v: Tensor, a: Tensor, out: Tensor | None = None) -> Tensor:
         """Compute the regressor at generalized coordinates.
 
         Args:
-            q: (B, n + 7): base position [m], base quaternion x, y, z, w (it is normalized; norm 0 means no rotation),
-                joint positions [rad or m]; (B, n) for a fixed base.
-            v: (B, nv): base linear and angular velocity in the base frame [m/s, rad/s], joint velocities.
-            a: (B, nv): time derivative of `v`.
+            q: (..., n + 7): base position [m], base quaternion x, y, z, w (it is normalized; norm 0 means no rotation),
+                joint positions [rad or m]; (..., n) for a fixed base. Any number of leading dimensions, or none.
+            v: (..., nv): base linear and angular velocity in the base frame [m/s, rad/s], joint velocities.
+            a: (..., nv): time derivative of `v`.
+            out: what an earlier call returned for as many samples; is written and returned. Constant zeros of K are not
+                written again, and no memory is allocated.
 
         Returns:
-            (B, nv + 6 F, 12 L) for L bodies and F limb force/torque sensors. It is a strided view of a batch-last
+            (..., nv + 6 F, 12 L) for L bodies and F limb force/torque sensors. It is a strided view of a batch-last
             tensor; call `.contiguous()` if the memory layout matters.
 
         Raises:
-            TypeError: an argument is not a tensor, or has another dtype or device than the module.
+            TypeError: an argument is not a tensor, has another dtype or device than the module, or requires a gradient
+                beside `out`.
             ValueError: a shape is wrong.
         """
+        samples, state = self.batch(q, v, a)
+        constants = self.get_buffer("table"), self.get_buffer("reals")
+        if out is not None:
+            K = self._memory(out, state)
+            if self.runs_compiled(q):
+                write_regressor(*state, *constants, K)
+            else:
+                K.copy_(self.reference(*state))
+            return out
+        compiled = self.runs_compiled(q)
+        K = call(regressor, *state, *constants, *self.shape, self.number) if compiled else self.reference(*state)
+        return K.permute(2, 0, 1).reshape(*samples, *self.shape)
+
+    def batch(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[torch.Size, tuple[Tensor, Tensor, Tensor]]:
+        """Leading dimensions of generalized coordinates, and these as (B, width) each; errors as of `forward`."""
         require_precision(self.tree, {"q": q, "v": v, "a": a})
-        return self.from_motion(motion_from_state(q, v, a, self.tree.n, not self.tree.base_rows, self.gravity))
+        require_state(q, v, a, self.tree.n, not self.tree.base_rows)
+        samples = q.shape[:-1]
+        if len(samples) == 1:
+            return samples, (q, v, a)
+        count = samples.numel()  # -1 would say nothing where there are no samples
+        return samples, (q.reshape(count, -1), v.reshape(count, v.shape[-1]), a.reshape(count, a.shape[-1]))
+
+    def reference(self, *arguments: Tensor) -> Tensor:
+        """K, (rows, columns, B), of q, v and a, (B, width) each, by torch's operators."""
+        motion = motion_from_state(*arguments, self.tree.n, not self.tree.base_rows, self.gravity)
+        return self.from_motion(motion).permute(1, 2, 0)
+
+    def _memory(self, out: Tensor, state: Sequence[Tensor]) -> Tensor:
+        """`out` as (rows, columns, B), contiguous."""
+        if torch.is_grad_enabled() and any(x.requires_grad for x in (*state, out)):
+            raise TypeError("out: found arguments that require a gradient; accepted: no out, or torch.no_grad()")
+        require_precision(self.tree, {"out": out})
+        samples = len(state[0])
+        if out.numel() == samples * self.shape[0] * self.shape[1]:
+            K = out.reshape(samples, *self.shape).permute(1, 2, 0)
+            if K.is_contiguous():
+                return K
+        shape = f"shape {tuple(out.shape)}, strides {out.stride()}"
+        raise ValueError(f"out: found {shape}; accepted: what an earlier call returned for {samples} samples")
 
     def from_motion(self, motion: Motion) -> Tensor:
-        """Compute the regressor, (B, nv + 6 F, 12 L), from a `Motion`."""
+        """Compute the regressor, (B, nv + 6 F, 12 L), from a `Motion`, by torch's operators."""
         tree = self.tree
         columns = self._columns
         joints = joint_motion(tree, motion)
@@ -103,7 +171,61 @@ class Regressor(nn.Module):
         )  # in place, gradients copy all of it
         if len(tree.node_of) < tree.n_nodes:
             K = K[:, tree.node_of]
-        return K.flatten(1, 2).permute(2, 0, 1)
+        K = K.flatten(1, 2).permute(2, 0, 1)
+        return K if self.reduction is None else K @ torch.linalg.pinv(self.reduction)
+
+
+class InverseDynamics(Referenced):
+    """Generalized forces `K(q, v, a) phi` without K: base wrench and joint torques, friction included.
+
+    Rows as of `Regressor`. Compiled and differentiable like it, by q, v, a and the parameters.
+    """
+
+    def __init__(
+        self, robot: Robot, gravity: tuple[float, float, float] = GRAVITY_WORLD, sign_width: float | None = None
+    ) -> None:
+        """Build the constants; arguments as of `Regressor`."""
+        super().__init__()
+        self.regressor = Regressor(robot, gravity, sign_width)
+
+    def forward(self, q: Tensor, v: Tensor, a: Tensor, phi: Tensor) -> Tensor:
+        """Compute the forces.
+
+        Args:
+            q: (..., n + 7), or (..., n) for a fixed base; see `Regressor`.
+            v: (..., nv).
+            a: (..., nv).
+            phi: (12 L,) for all samples, or (..., 12 L) of each; `robot.nominal.flatten()` has the URDF's.
+
+        Returns:
+            (..., nv + 6 F): base force [N] and moment [N m], then joint torques [N m or N].
+
+        Raises:
+            TypeError: an argument is not a tensor, or has another dtype or device than the module.
+            ValueError: a shape is wrong.
+        """
+        module = self.regressor
+        samples, state = module.batch(q, v, a)
+        columns = module.shape[1]
+        require_precision(module.tree, {"phi": phi})
+        if phi.shape[-1:] != (columns,) or phi.shape[:-1] not in (samples, ()):
+            accepted = f"({columns},) or {(*samples, columns)}"
+            raise ValueError(f"phi: found shape {tuple(phi.shape)}; accepted: {accepted}")
+        if phi.ndim > 1:
+            phi = phi.reshape(-1, columns)
+        inputs = (*state, phi)
+        if self.runs_compiled(q):
+            constants = module.get_buffer("table"), module.get_buffer("reals")
+            forces = call(inverse_dynamics, *inputs, *constants, *module.shape, self.number)
+        else:
+            forces = self.reference(*inputs)
+        return forces.reshape(*samples, -1)
+
+    def reference(self, *arguments: Tensor) -> Tensor:
+        """K phi, (B, rows), by torch's operators."""
+        *state, phi = arguments
+        K = self.regressor.reference(*state).permute(2, 0, 1)
+        return (K @ phi[..., None])[..., 0]
 
 
 @dataclass(frozen=True)
@@ -267,7 +389,7 @@ def contact_arms(
     return rolling_arms(radius, normal, along)
 
 
-class FrameJacobian(nn.Module):
+class FrameJacobian(Referenced):
     """Jacobian of a URDF frame: `J(q) v` is the twist of its origin in its own axes, linear velocity first.
 
     With a radius, the frame rolls on the ground as a sphere about its origin c, or as a cylinder about `axis` (see
@@ -300,35 +422,56 @@ class FrameJacobian(nn.Module):
         self._body, T_joint_frame = self.tree.frame(robot, frame, centre)
         unit_wrenches = wrench_transform(T_joint_frame).T
         self.register_buffer("unit_wrenches", torch.tensor(unit_wrenches.copy()), persistent=False)
-        self._joints = range(robot.n_dofs)
         self.radius = radius
         self.axis = axis
+        table, reals = robot_tables(
+            self.tree, [()] * self.tree.n_nodes, self.tree.T_joint_link, GRAVITY_WORLD, (self._body, T_joint_frame)
+        )
+        for name, constants in (("table", table), ("reals", reals)):
+            self.register_buffer(name, constants, persistent=False)
 
     def forward(self, q: Tensor, normal: Tensor | None = None) -> Tensor:
         """Compute the Jacobian.
 
         Args:
-            q: (B, n + 7), or (B, n) for a fixed base (see `Regressor`).
-            normal: of the ground under a rolling frame, (B, 3) or (3,), unit vectors in the world (in the base frame if
-                the base is fixed); None for z.
+            q: (..., n + 7), or (..., n) for a fixed base (see `Regressor`).
+            normal: of the ground under a rolling frame, (..., 3) or (3,), unit vectors in the world (in the base frame
+                if the base is fixed); None for z.
 
         Returns:
-            (B, 6, n_rows) with n_rows = nv + 6 F: each of F limb force/torque sensors adds six columns at the end.
+            (..., 6, n_rows) with n_rows = nv + 6 F: each of F limb force/torque sensors adds six columns at the end.
 
         Raises:
             TypeError: `q` is not a tensor, or has another dtype or device than the module.
             ValueError: the shape of `q` is wrong.
         """
-        tree = self.tree
-        states = states_at_rest(tree, independent_positions(tree, q))
-        units = self.get_buffer("unit_wrenches")
-        arms = None
+        positions = independent_positions(self.tree, q)
+        samples = q.shape[:-1]
+        q = q.reshape(len(positions), q.shape[-1])
         if self.radius:
-            up = q.new_tensor([0.0, 0.0, 1.0]) if normal is None else normal.to(q)
-            up = up.expand(len(q), 3)
-            if tree.base_rows:
-                up = (rotation_matrix(q[:, 3:7]).mT @ up[..., None])[..., 0]
-            arms = contact_arms(states, self._body, units[:3, :3].T, self.radius, up.T, self.axis)
-        wrenches = wrenches_at_base(states, self._body, units, arms)
-        J = generalized_forces(tree, joint_screw_axes(tree, states), self._body, wrenches, self._joints)
-        return J.permute(2, 0, 1)
+            J = self._rolling(q, q.new_tensor([0.0, 0.0, 1.0]) if normal is None else normal.to(q))
+        elif self.runs_compiled(q):
+            shape = self.tree.n_rows, 0
+            J = call(frame_jacobian, q, self.get_buffer("table"), self.get_buffer("reals"), *shape, self.number)
+        else:
+            J = self.reference(q)
+        return J.permute(2, 0, 1).reshape(*samples, *J.shape[:2])
+
+    def reference(self, *arguments: Tensor) -> Tensor:
+        """The Jacobian, (6, n_rows, B), of q, (B, width), by torch's operators, without a radius."""
+        (q,) = arguments
+        return self._of_wrenches(states_at_rest(self.tree, independent_positions(self.tree, q)), None)
+
+    def _rolling(self, q: Tensor, normal: Tensor) -> Tensor:
+        states = states_at_rest(self.tree, independent_positions(self.tree, q))
+        up = normal.reshape(-1, 3).expand(len(q), 3)
+        if self.tree.base_rows:
+            up = (rotation_matrix(q[:, 3:7]).mT @ up[..., None])[..., 0]
+        axes = self.get_buffer("unit_wrenches")[:3, :3].T
+        return self._of_wrenches(states, contact_arms(states, self._body, axes, self.radius, up.T, self.axis))
+
+    def _of_wrenches(self, states: BodyStates, arms: Tensor | None) -> Tensor:
+        tree = self.tree
+        wrenches = wrenches_at_base(states, self._body, self.get_buffer("unit_wrenches"), arms)
+        joints = range(tree.n_dofs)
+        return generalized_forces(tree, joint_screw_axes(tree, states), self._body, wrenches, joints)
