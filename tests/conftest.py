@@ -18,6 +18,7 @@ from run_figures import EVENTS, draw, draw_nothing
 from synthetic import load
 
 import torchid
+from torchid import kernels
 from torchid.cli import main
 from torchid.robot import Robot
 
@@ -59,6 +60,19 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
             pytrace=False,
         )
     return result
+
+
+@pytest.fixture(scope="module", params=["compiled", "torch"])
+def both_ways(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Run tests of modules with the compiled kernels, and as where torchid was installed without a compiler."""
+    if request.param == "compiled":
+        if kernels.compiled() is None:
+            pytest.skip(kernels.why_not_compiled())
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, "_load", lambda: (None, "installed without a compiler"))
+        yield
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:

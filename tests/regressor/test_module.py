@@ -37,6 +37,8 @@ from torchid.regressor.regressor import joint_row, joint_rows
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 
+pytestmark = pytest.mark.usefixtures("both_ways")
+
 
 @pytest.mark.parametrize("samples", [0, 1, 5])
 def test_shapes_follow_the_batch(small: Robot, samples: int) -> None:
@@ -127,7 +129,7 @@ WRONG_SHAPES = {
     "more v than q": lambda q, v, a: (q[:2], v, a),
     "one v for all": lambda q, v, a: (q, v[:1], a[:1]),
     "one q for all": lambda q, v, a: (q[:1], v, a),
-    "no batch": lambda q, v, a: (q[0], v[0], a[0]),
+    "v without a batch": lambda q, v, a: (q, v[0], a[0]),
 }
 
 

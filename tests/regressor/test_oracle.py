@@ -36,6 +36,7 @@ from torchid.regressor.kinematics import joint_motion
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 
+pytestmark = pytest.mark.usefixtures("both_ways")
 REFUSED = ("ur3.urdf", "alex_psyonic_hands.urdf")
 REAL = [path for path in sorted(ROBOTS.rglob("*.urdf")) if path.name not in REFUSED]
 

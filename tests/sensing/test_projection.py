@@ -17,6 +17,7 @@ from torchid.regressor import FrameJacobian
 from torchid.robot import Robot
 from torchid.sensing import Contact, ProjectedGroup, Projection
 
+pytestmark = pytest.mark.usefixtures("both_ways")
 FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("LF", "RF", "LH", "RH")]
 robot_of = cache(load)
 seeds = st.integers(0, 2**32 - 1)
@@ -24,10 +25,15 @@ few = settings(max_examples=20, deadline=None, derandomize=True)
 
 
 def numpy_projector(A: Array) -> tuple[Array, float]:
-    """Onto the null space of one matrix (k, m), and the rounding to expect of it, which grows with A's condition."""
+    """Onto the null space of one matrix (k, m), and the rounding to expect of it.
+
+    It grows with A's condition, and with singular values of redundant rows, which are dropped.
+    """
     _, values, Vh = np.linalg.svd(A)
-    kept = values[values > 1e-9 * max(values, default=0.0)]
-    return Vh[len(kept) :].T @ Vh[len(kept) :], 1e-14 * float(kept[0] / kept[-1] if len(kept) else 1.0)
+    is_kept = values > 1e-9 * max(values, default=0.0)
+    kept, dropped = values[is_kept], max(values[~is_kept], default=0.0)
+    rounding = (1e-14 * kept[0] + dropped) / kept[-1] if len(kept) else 1e-14
+    return Vh[len(kept) :].T @ Vh[len(kept) :], float(rounding)
 
 
 # ------------------------------------------------------------------------------------------------------- projection
@@ -56,8 +62,8 @@ class Scene:
     def active(self) -> Tensor:
         return self.touching[:, [c for c, _ in self.components]]
 
-    def project(self, projection: Projection) -> list[ProjectedGroup]:
-        return projection(self.J, self.active, self.K, self.torque, self.wrench)
+    def project(self, projection: Projection, **options: bool) -> list[ProjectedGroup]:
+        return projection(self.J, self.active, self.K, self.torque, self.wrench, **options)
 
     def expected(self, sample: int, torque: Array, wrench: Array) -> tuple[Array, float, Array]:
         """Projector (nv, nv), its rounding, and measured force (nv,) of one sample, from the masks, by numpy."""
@@ -156,11 +162,13 @@ def test_what_is_not_measured_or_does_not_touch_never_reaches_the_result(noise: 
     scene = Scene(robot_of(ANYMAL), FEET, 9)
     torque, wrench = rng.random(12) < 0.5, rng.random(12) < 0.5
     project = Projection(torque, wrench, 6, noise, noise, noise)
+    readings = scene.wrench
+    scene.wrench = readings.clone().requires_grad_()
     expected = scene.project(project)
     scene.torque[:, ~torque] = torch.nan
-    scene.wrench[:, ~wrench] = torch.nan
-    scene.wrench[~scene.active] = torch.nan
-    scene.wrench.requires_grad_()
+    readings[:, ~wrench] = torch.nan
+    readings[~scene.active] = torch.nan
+    scene.wrench = readings.requires_grad_()
     for group, other in zip(scene.project(project), expected, strict=True):
         torch.testing.assert_close(group.f, other.f, rtol=0.0, atol=0.0)
         torch.testing.assert_close(group.K, other.K, rtol=0.0, atol=0.0)
@@ -217,6 +225,67 @@ def test_flags_that_are_numbers_are_refused_and_never_taken_for_indices() -> Non
         Projection([True] * 2, [False] * 3)(
             torch.ones(4, 3, 8), numbers, torch.ones(4, 8, 2), torch.ones(4, 2), torch.ones(4, 3)
         )
+
+
+@few
+@given(seed=seeds)
+def test_padded_samples_are_those_of_their_groups(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene, share = Scene(robot_of(ANYMAL), FEET, seed), rng.random(2)
+    torque, wrench = rng.random(12) < share[0], rng.random(12) < share[1]
+    noise = tuple(map(torch.from_numpy, noises(scene, rng))) if rng.random() < 0.5 else (None,) * 3
+    project = Projection(torque, wrench, 6, *noise)
+    padded = scene.project(project, pad=True)
+    assert padded.V.shape == (12, 18, 6 + int(torque.sum()))
+    for group in scene.project(project):
+        V, K, f = (x[group.index] for x in (padded.V, padded.K, padded.f))
+        assert torch.equal(padded.base_rank[group.index], group.base_rank)
+        assert (V.any(1).sum(1) == group.V.shape[2]).all()
+        np.testing.assert_allclose(V @ V.mT, group.V @ group.V.mT, rtol=0.0, atol=1e-12 * float(V.abs().max() ** 2))
+        np.testing.assert_allclose(K.mT @ K, group.K.mT @ group.K, rtol=0.0, atol=1e-11 * float(K.abs().max() ** 2))
+        size = float(K.abs().max() * f.abs().max())
+        np.testing.assert_allclose(K.mT @ f[..., None], group.K.mT @ group.f[..., None], rtol=0.0, atol=1e-11 * size)
+
+
+@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
+def test_padded_projections_have_any_leading_dimensions_map_and_have_gradients(noise: float | None) -> None:
+    scene = Scene(robot_of(ANYMAL), FEET, 15, samples=6)
+    project = Projection([True] * 9 + [False] * 3, [True] * 3 + [False] * 9, 6, noise, noise, noise)
+    batch = (scene.J, scene.active, scene.K, scene.torque, scene.wrench)
+    padded = project(*batch, pad=True)
+    split = project(*(x.unflatten(0, (2, 3)) for x in batch), pad=True)
+    single = project(*(x[4] for x in batch), pad=True)
+
+    def squares(*part: Tensor) -> Tensor:
+        group = project(*part, pad=True)
+        return (group.K.mean(-1) - group.f).square().sum(-1)
+
+    assert split.index.shape == (2, 3)
+    for name in ("V", "K", "f"):
+        found = getattr(padded, name)
+        torch.testing.assert_close(getattr(split, name).flatten(0, 1), found)
+        torch.testing.assert_close(getattr(single, name), found[4])
+    torch.testing.assert_close(torch.func.vmap(squares)(*batch), squares(*batch))
+    J = scene.J.clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda J: squares(J, *batch[1:]), J, atol=1e-5, rtol=1e-6, fast_mode=True)
+    by_groups = Scene.project(scene, project)
+    total = sum((group.K.mean(2) - group.f).square().sum() for group in by_groups)
+    torch.testing.assert_close(squares(*batch).sum(), total)
+
+
+def test_memory_of_a_padded_projection_is_written_again() -> None:
+    scene, other = (Scene(robot_of(ANYMAL), FEET, seed) for seed in (16, 17))
+    project = Projection([True] * 12, [False] * 12)
+    out = scene.project(project, pad=True)
+    addresses = [x.data_ptr() for x in (out.V, out.K, out.f)]
+    again = project(other.J, other.active, other.K, other.torque, other.wrench, pad=True, out=out)
+    assert [x.data_ptr() for x in (again.V, again.K, again.f)] == addresses
+    expected = other.project(project, pad=True)
+    for name in ("V", "K", "f", "active"):
+        assert torch.equal(getattr(again, name), getattr(expected, name))
+    fewer = [x[:5] for x in (other.J, other.active, other.K, other.torque, other.wrench)]
+    with pytest.raises(ValueError, match=r"out.V: found \(12, 18, 18\) torch.float64; accepted: \(5, 18, 18\)"):
+        project(*fewer, pad=True, out=out)
 
 
 SOLOS_FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]

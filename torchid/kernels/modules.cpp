@@ -6,11 +6,11 @@
 // equations for people.
 
 #include "lanes.h"
+#include "threads.h"
 
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <thread>
 #include <vector>
 
 namespace {
@@ -547,30 +547,25 @@ template <class T> void frame_grad(const Robot<T> &robot, const Call<T> &call, I
   }
 }
 
-// In threads, each with groups of its own: results do not depend on how many they are
-template <class T>
-void run(void (*work)(const Robot<T> &, const Call<T> &, Index, Index), const Index *table, const T *reals,
-         const Call<T> &call, Index threads) {
-  const Robot<T> robot(table, reals);
-  const Index step = GROUPS * LANES<T>, blocks = (call.samples + step - 1) / step;
-  threads = std::max<Index>(1, std::min(threads, blocks / 8));
-  std::vector<std::thread> others;
-  const auto part = [&](Index k) {
-    work(robot, call, blocks * k / threads * step, std::min(call.samples, blocks * (k + 1) / threads * step));
-  };
-  for (Index k = 1; k < threads; ++k) others.emplace_back(part, k);
-  part(0);
-  for (auto &other : others) other.join();
-}
-
 }  // namespace
 
-#define ENTRIES(T, NAME)                                                                                              \
-  extern "C" void torchid_dynamics_##NAME(const Index *table, const T *reals, const Call<T> *call, Index threads) {   \
-    run<T>(call->grad ? dynamics_grad<T> : dynamics<T>, table, reals, *call, threads);                                \
-  }                                                                                                                   \
-  extern "C" void torchid_frame_##NAME(const Index *table, const T *reals, const Call<T> *call, Index threads) {      \
-    run<T>(call->grad ? frame_grad<T> : frame<T>, table, reals, *call, threads);                                      \
-  }
-ENTRIES(double, float64)
-ENTRIES(float, float32)
+template <class T> void run(const Index *table, const T *reals, const Call<T> &call, Index threads, bool of_frame) {
+  const Robot<T> robot(table, reals);
+  const auto work = of_frame ? (call.grad ? frame_grad<T> : frame<T>) : (call.grad ? dynamics_grad<T> : dynamics<T>);
+  in_threads(call.samples, GROUPS * LANES<T>, threads, [&](Index a, Index b) { work(robot, call, a, b); });
+}
+
+extern "C" {
+void torchid_dynamics_float64(const Index *table, const double *reals, const Call<double> *call, Index threads) {
+  run(table, reals, *call, threads, false);
+}
+void torchid_dynamics_float32(const Index *table, const float *reals, const Call<float> *call, Index threads) {
+  run(table, reals, *call, threads, false);
+}
+void torchid_frame_float64(const Index *table, const double *reals, const Call<double> *call, Index threads) {
+  run(table, reals, *call, threads, true);
+}
+void torchid_frame_float32(const Index *table, const float *reals, const Call<float> *call, Index threads) {
+  run(table, reals, *call, threads, true);
+}
+}

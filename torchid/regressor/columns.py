@@ -121,7 +121,10 @@ def regrouped_columns(tree: KinematicTree) -> tuple[list[tuple[int, ...]], Array
         at = {column: start + place for place, column in enumerate(numbers)}
         columns.append(tuple(at.get(column, -1) for column in range(per_body)) if at else ())
         friction = per_body * tree.body_of[node] + inertial
-        rows += [regrouped[taken : taken + len(kept)].reshape(len(kept), -1), of_all[friction : friction + 2 * moves]]
+        rows += [
+            regrouped[taken : taken + len(kept)].reshape(len(kept), len(of_all)),
+            of_all[friction : friction + 2 * moves],
+        ]
         taken += len(kept)
     frames = np.tile(np.eye(4), (tree.n_nodes, 1, 1))
     return columns, frames, torch.from_numpy(np.concatenate(rows))

@@ -46,7 +46,7 @@ def robot_tables(
         frame: node that carries one, and its pose, (4, 4), in the node's joint frame: is added as the last node.
     """
     joint_map = tree.joint_map.double().cpu().numpy()
-    dofs = [int(np.argmax(row != 0.0)) if row.any() else -1 for row in joint_map]
+    dofs = [next(iter(np.flatnonzero(row).tolist()), -1) for row in joint_map]
     nodes = list[list[int]]()
     terms = list[tuple[int, int, int]]()
     for node, own in enumerate(columns):
@@ -56,7 +56,7 @@ def robot_tables(
         first = [max(tree.parents[node], 0), tree.slides[node], dofs[node], moves, framed, len(terms), len(felt)]
         nodes.append([*first, *(own or _NO_COLUMNS)])
         terms += felt
-    ratios = joint_map[range(len(dofs)), dofs], tree.joint_constant.double().cpu().numpy()[:, 0]
+    ratios = joint_map.sum(axis=1), tree.joint_constant.double().cpu().numpy()[:, 0]
     poses = tree.T_parent_joint[:, :3].reshape(-1, 12), frames[:, :3].reshape(-1, 12)
     reals = np.column_stack([*poses, *ratios])
     if frame is not None:

@@ -73,7 +73,8 @@ def motion_from_state(
         ValueError: a shape is wrong.
     """
     require_state(q, v, a, n, fixed_base)
-    q, v, a = (x.reshape(-1, x.shape[-1]) for x in (q, v, a))
+    if q.ndim != 2:
+        q, v, a = (x.reshape(q.shape[:-1].numel(), x.shape[-1]) for x in (q, v, a))
     g_world = q.new_tensor(gravity)
     if fixed_base:
         zero = q.new_zeros(q.shape[0], 3)
@@ -203,7 +204,7 @@ def independent_positions(tree: KinematicTree, q: Tensor) -> Tensor:
     if q.shape[-1:] != (width,):
         raise ValueError(f"q: found shape {tuple(q.shape)}; accepted: (..., {width})")
     require_precision(tree, {"q": q})
-    return q.reshape(-1, width)[:, width - tree.n :]
+    return q.reshape(q.shape[:-1].numel(), width)[:, width - tree.n :]
 
 
 def states_at_rest(tree: KinematicTree, joint_position: Tensor) -> BodyStates:

@@ -129,11 +129,13 @@ class Regressor(Referenced):
         if len(samples) == 1:
             return samples, (q, v, a)
         count = samples.numel()  # -1 would say nothing where there are no samples
-        return samples, (q.reshape(count, -1), v.reshape(count, v.shape[-1]), a.reshape(count, a.shape[-1]))
+        (q, v, a) = (x.reshape(count, x.shape[-1]) for x in (q, v, a))
+        return samples, (q, v, a)
 
     def reference(self, *arguments: Tensor) -> Tensor:
         """K, (rows, columns, B), of q, v and a, (B, width) each, by torch's operators."""
-        motion = motion_from_state(*arguments, self.tree.n, not self.tree.base_rows, self.gravity)
+        (q, v, a) = arguments
+        motion = motion_from_state(q, v, a, self.tree.n, not self.tree.base_rows, self.gravity)
         return self.from_motion(motion).permute(1, 2, 0)
 
     def _memory(self, out: Tensor, state: Sequence[Tensor]) -> Tensor:
@@ -212,14 +214,14 @@ class InverseDynamics(Referenced):
             accepted = f"({columns},) or {(*samples, columns)}"
             raise ValueError(f"phi: found shape {tuple(phi.shape)}; accepted: {accepted}")
         if phi.ndim > 1:
-            phi = phi.reshape(-1, columns)
+            phi = phi.reshape(samples.numel(), columns)
         inputs = (*state, phi)
         if self.runs_compiled(q):
             constants = module.get_buffer("table"), module.get_buffer("reals")
             forces = call(inverse_dynamics, *inputs, *constants, *module.shape, self.number)
         else:
             forces = self.reference(*inputs)
-        return forces.reshape(*samples, -1)
+        return forces.reshape(*samples, module.shape[0])
 
     def reference(self, *arguments: Tensor) -> Tensor:
         """K phi, (B, rows), by torch's operators."""

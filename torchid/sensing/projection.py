@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal, overload
 
 import torch
 from torch import Tensor, nn
 
+from torchid.kernels import compiled
 from torchid.reprs import short_repr
 from torchid.rounding import BASE_RANK_TOLERANCE, KINEMATIC_TOLERANCE, relative_tolerance
+from torchid.sensing.padded import Sensors, project, write_projection
 
 _ROUNDINGS = 100.0  # rounding error of a Jacobian entry, in units of rounding of a unit term
 _SUSPECT = 1e3  # below this many tolerances, the QR path hands the sample to an SVD
@@ -17,15 +20,15 @@ _SUSPECT = 1e3  # below this many tolerances, the QR path hands the sample to an
 
 @dataclass(frozen=True)
 class ProjectedGroup:
-    """Projected samples that share a contact state and a rank r.
+    """Projected samples that share a contact state and a rank r, or all of a batch, padded with zeros.
 
     Attributes:
-        index: (B',), numbers of the samples in the batch.
-        active: (k,) bool, rows of J_C in contact.
-        V: (B', n_rows, r), V_x; orthonormal, or whitened if noise was given.
-        K: (B', r, P), V_x^T K.
-        f: (B', r), V_x^T f.
-        base_rank: (B',), rank(S_b V_x); 6 if the base is observable.
+        index: (B',), numbers of the samples in the batch; with leading dimensions `...` where padded.
+        active: (k,) bool, rows of J_C in contact; (..., k) where padded.
+        V: (B', n_rows, r), V_x; orthonormal, or whitened if noise was given; (..., n_rows, m) where padded.
+        K: (B', r, P), V_x^T K; (..., m, P) where padded.
+        f: (B', r), V_x^T f; (..., m) where padded.
+        base_rows: 6, or 0 for a fixed base.
     """
 
     index: Tensor
@@ -33,9 +36,33 @@ class ProjectedGroup:
     V: Tensor
     K: Tensor
     f: Tensor
-    base_rank: Tensor
+    base_rows: int
 
     __repr__ = short_repr
+
+    def by_rank(self) -> list[ProjectedGroup]:
+        """Groups of a contact state and a rank each, of a padded one with samples (B,)."""
+        kept = self.V.any(-2)
+        columns = kept.to(torch.int8).argsort(dim=1, descending=True, stable=True)
+        kinds = torch.cat([self.active, kept.sum(1, keepdim=True)], dim=1)
+        states, which = torch.unique(kinds, dim=0, return_inverse=True)
+        groups = []
+        for number, (*_, rank) in enumerate(states.tolist()):
+            index = torch.nonzero(which == number)[:, 0]
+            at = (index[:, None], columns[index, :rank])
+            V = self.V.mT[at].mT
+            groups.append(ProjectedGroup(index, self.active[index[0]], V, self.K[at], self.f[at], self.base_rows))
+        return groups
+
+    @property
+    def base_rank(self) -> Tensor:
+        """rank(S_b V_x), (B',); 6 if the base is observable, 0 for a fixed base."""
+        V = self.V.detach()
+        if not self.base_rows:
+            return torch.zeros_like(V[..., 0, 0], dtype=torch.int64)
+        U = torch.linalg.svd(V, full_matrices=False).U
+        in_basis = torch.arange(U.shape[-1], device=U.device) < V.any(-2).sum(-1, keepdim=True)
+        return base_rank(base_singular_values(U * in_basis[..., None, :]))
 
 
 class Projection(nn.Module):
@@ -54,6 +81,11 @@ class Projection(nn.Module):
     K may be any matrix with the rows of the dynamics. Fits use the faster `torchid.RowBuilder` with the same null
     spaces (`tests/problem/test_rows_two_ways.py` compares both).
     """
+
+    kept: Tensor
+    rows: Tensor
+    unmeasured: Tensor
+    measured: Tensor
 
     def __init__(
         self,
@@ -87,9 +119,13 @@ class Projection(nn.Module):
             if mask.ndim != 1:
                 raise ValueError(f"{name}: found shape {tuple(mask.shape)}; accepted: 1-D, one bool per row")
         self.base_rows = base_rows
+        self._compiles = compiled() is not None
         self.register_buffer("torque_measured", torque, persistent=False)
         self.register_buffer("wrench_measured", wrench, persistent=False)
         self.register_buffer("kept", torch.cat([torque.new_ones(base_rows), torque]), persistent=False)
+        for name, mask in (("rows", self.kept), ("unmeasured", ~wrench), ("measured", wrench)):
+            self.register_buffer(name, torch.nonzero(mask)[:, 0], persistent=False)
+        self._size = 1.0  # of the terms that are summed in an entry of the blocked rows
         self._whiten = torque_noise is not None
         if self._whiten:
             torque_std, wrench_std, base_std = (
@@ -99,6 +135,7 @@ class Projection(nn.Module):
             wrench_std = wrench_std.expand(len(self.get_buffer("wrench_measured")))
             if not bool((rows > 0.0).all()) or not bool((wrench_std > 0.0).all()):
                 raise ValueError("torque_noise, wrench_noise, base_noise: found 0 or less; accepted: positive numbers")
+            self._size = float(torch.linalg.vector_norm(1.0 / rows[self.kept]))
             self.register_buffer("row_std", rows, persistent=False)
             self.register_buffer("wrench_std", wrench_std, persistent=False)
 
@@ -108,7 +145,33 @@ class Projection(nn.Module):
         wrench = self.get_buffer("wrench_measured")
         return f"measured: {torque.sum()} of {len(torque)} torques, {wrench.sum()} of {len(wrench)} contact components"
 
-    def forward(self, J_C: Tensor, active: Tensor, K: Tensor, torque: Tensor, wrench: Tensor) -> list[ProjectedGroup]:
+    @overload
+    def forward(
+        self, J_C: Tensor, active: Tensor, K: Tensor, torque: Tensor, wrench: Tensor, pad: Literal[False] = False
+    ) -> list[ProjectedGroup]: ...
+
+    @overload
+    def forward(
+        self,
+        J_C: Tensor,
+        active: Tensor,
+        K: Tensor,
+        torque: Tensor,
+        wrench: Tensor,
+        pad: Literal[True],
+        out: ProjectedGroup | None = None,
+    ) -> ProjectedGroup: ...
+
+    def forward(
+        self,
+        J_C: Tensor,
+        active: Tensor,
+        K: Tensor,
+        torque: Tensor,
+        wrench: Tensor,
+        pad: bool = False,
+        out: ProjectedGroup | None = None,
+    ) -> list[ProjectedGroup] | ProjectedGroup:
         """Project a batch.
 
         Args:
@@ -117,15 +180,27 @@ class Projection(nn.Module):
             K: (B, n_rows, P), or any other matrix with the rows of the dynamics.
             torque: (B, n) [N m]; unmeasured values are ignored.
             wrench: (B, k), in the order of the rows of J_C [N, N m]; unmeasured or inactive values are ignored.
+            pad: whether to return one group of one shape, whatever the contact states. It has as many rows as there are
+                base rows and measured torques. Columns of V_x that a sample's contacts take away are zero, and so are
+                these rows of K and f. The arguments may then have any number of leading dimensions in place of B, or
+                none, and `torch.func.vmap` may map over them.
+            out: with `pad`, what an earlier call returned for as many samples; its tensors are written again, which
+                saves the time to allocate memory.
 
         Returns:
-            One group per contact state and rank; every sample is in exactly one group.
+            One group per contact state and rank; every sample is in exactly one group. With `pad` one for all samples.
 
         Raises:
             TypeError: an argument is not a tensor, `active` is not bool, or another dtype differs from that of `K`.
             ValueError: a shape is wrong.
         """
-        self._require_batch({"J_C": J_C, "active": active, "K": K, "torque": torque, "wrench": wrench})
+        samples = self._require_batch({"J_C": J_C, "active": active, "K": K, "torque": torque, "wrench": wrench}, pad)
+        arguments = (J_C, active, K, torque, wrench)
+        differentiable = torch.is_grad_enabled() and any(x.requires_grad for x in arguments)
+        if pad:
+            return self._padded(samples, out, differentiable, *arguments)
+        if self._runs_compiled(K):
+            return self._padded(samples, None, differentiable, *arguments).by_rank()
         groups: list[ProjectedGroup] = []
         if active.shape[1]:
             states, which = torch.unique(active, dim=0, return_inverse=True)
@@ -137,8 +212,8 @@ class Projection(nn.Module):
             groups += self._state(index, state, J_C[index], K[index], torque[index], wrench[index])
         return groups
 
-    def _require_batch(self, batch: dict[str, Tensor]) -> None:
-        """Raise TypeError or ValueError if the arguments of `forward` do not fit together."""
+    def _require_batch(self, batch: dict[str, Tensor], pad: bool) -> torch.Size:
+        """Leading dimensions; raise TypeError or ValueError if the arguments of `forward` do not fit together."""
         for name, x in batch.items():
             if not isinstance(x, Tensor):
                 raise TypeError(f"{name}: found {type(x).__name__}; accepted: a tensor")
@@ -146,16 +221,77 @@ class Projection(nn.Module):
         rows = len(self.get_buffer("kept"))
         k = len(self.get_buffer("wrench_measured"))
         K = batch["K"]
-        B = shapes[0][:1]
+        samples = batch["J_C"].shape[:-2]
         n = rows - self.base_rows
-        if K.ndim != 3 or shapes != [(*B, k, rows), (*B, k), (*B, rows, K.shape[2]), (*B, n), (*B, k)]:
-            accepted = f"(B, {k}, {rows}), (B, {k}), (B, {rows}, P), (B, {n}), (B, {k})"
+        widths = ((k, rows), (k,), (rows, *K.shape[-1:]), (n,), (k,))
+        if shapes != [(*samples, *width) for width in widths] or not (pad or len(samples) == 1):
+            B = "..." if pad else "B"
+            accepted = f"({B}, {k}, {rows}), ({B}, {k}), ({B}, {rows}, P), ({B}, {n}), ({B}, {k})"
             raise ValueError(f"{', '.join(batch)}: found shapes {', '.join(map(str, shapes))}; accepted: {accepted}")
         for name, x in batch.items():
             expected = torch.bool if name == "active" else K.dtype
             if x.dtype != expected:
                 suffix = "" if name == "active" else ", the dtype of K"
                 raise TypeError(f"{name}: found {x.dtype}; accepted: {expected}{suffix}")
+        return samples
+
+    def _runs_compiled(self, K: Tensor) -> bool:
+        return self._compiles and K.is_cpu and K.dtype in (torch.float64, torch.float32)
+
+    def _padded(
+        self, samples: torch.Size, out: ProjectedGroup | None, differentiable: bool, *arguments: Tensor
+    ) -> ProjectedGroup:
+        """One group of all samples."""
+        (J, active, K, _, _) = arguments
+        if out is not None and differentiable:
+            raise TypeError("out: found arguments that require a gradient; accepted: no out, or torch.no_grad()")
+        memory = None if out is None else self._memory(out, samples, K)
+        sensors = self._sensors(K.dtype)
+        if self._runs_compiled(K):
+            flat = [x.detach().flatten(0, len(samples) - 1) if samples else x.detach()[None] for x in arguments]
+            inputs = (*flat, sensors.constants, self.base_rows, sensors.floor, sensors.tolerance)
+            if memory is None:
+                memory = project(*inputs)
+            else:
+                write_projection(*inputs, memory)
+            V, projected, f = (x.reshape(*samples, *x.shape[1:]) for x in memory)
+            if differentiable:
+                basis = V[..., sensors.kept, :] * sensors.row_std[:, None]
+                V = sensors.whitened(basis, J, active) if J.requires_grad else V
+                projected, f = sensors.products(V, *arguments)
+        else:
+            V, projected, f = sensors.project(*arguments)
+            if out is not None:
+                V, projected, f = (
+                    x.copy_(made) for x, made in zip((out.V, out.K, out.f), (V, projected, f), strict=True)
+                )
+        index = torch.arange(samples.numel(), device=J.device).reshape(samples)
+        return ProjectedGroup(index, active, V, projected, f, self.base_rows)
+
+    def _memory(self, out: ProjectedGroup, samples: torch.Size, K: Tensor) -> list[Tensor]:
+        """The tensors of `out`, (B, ...) each; raise ValueError if they have other shapes than the result."""
+        rows = len(self.kept)
+        m = len(self.rows)
+        tensors = {"V": out.V, "K": out.K, "f": out.f}
+        for (name, x), shape in zip(tensors.items(), ((rows, m), (m, K.shape[-1]), (m,)), strict=True):
+            if x.shape != (*samples, *shape) or x.dtype != K.dtype or not x.is_contiguous():
+                accepted = f"{(*samples, *shape)} {K.dtype}, contiguous: what an earlier call returned"
+                raise ValueError(f"out.{name}: found {tuple(x.shape)} {x.dtype}; accepted: {accepted}")
+        return [x.view(-1, *x.shape[len(samples) :]) for x in tensors.values()]
+
+    def _sensors(self, dtype: torch.dtype) -> Sensors:
+        """What is measured, in a precision."""
+        kept, unmeasured, measured = (self.get_buffer(name) for name in ("rows", "unmeasured", "measured"))
+        if self._whiten:
+            row_std = self.get_buffer("row_std").to(dtype)[kept]
+            wrench_std = self.get_buffer("wrench_std").to(dtype)[measured]
+        else:
+            row_std = torch.ones_like(kept, dtype=dtype)
+            wrench_std = row_std[:0]
+        eps = torch.finfo(dtype).eps
+        tolerance = relative_tolerance(KINEMATIC_TOLERANCE, (len(unmeasured), len(kept)), eps)
+        floor = _ROUNDINGS * eps * self._size
+        return Sensors(kept, unmeasured, measured, row_std, wrench_std, self.base_rows, floor, tolerance)
 
     def _state(
         self, index: Tensor, state: Tensor, J: Tensor, K: Tensor, torque: Tensor, wrench: Tensor
@@ -170,14 +306,8 @@ class Projection(nn.Module):
         for rows, basis in self._bases(J[:, state & ~self.get_buffer("wrench_measured")], J_m, measured):
             V = basis.new_zeros(basis.shape[0], len(kept), basis.shape[2])
             V[:, kept] = basis
-            if self.base_rows:
-                fixed = V.detach()
-                rank = base_rank(base_singular_values(torch.linalg.qr(fixed).Q if self._whiten else fixed))
-            else:
-                rank = index.new_zeros(V.shape[0])
-            groups.append(
-                ProjectedGroup(index[rows], state, V, V.mT @ K[rows], (V.mT @ f[rows, :, None])[..., 0], rank)
-            )
+            projected = V.mT @ K[rows], (V.mT @ f[rows, :, None])[..., 0]
+            groups.append(ProjectedGroup(index[rows], state, V, *projected, self.base_rows))
         return groups
 
     def _bases(self, J_x: Tensor, J_m: Tensor, measured: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
@@ -190,15 +320,15 @@ class Projection(nn.Module):
 
 
 def base_singular_values(V: Tensor) -> Tensor:
-    """Singular values of S_b V_x, (B, 6), zeros where V_x has fewer than six columns; V: (B, n_rows, r) orthonormal."""
-    values = torch.linalg.svdvals(V[:, :6])
-    return nn.functional.pad(values, (0, 6 - values.shape[1]))
+    """Singular values of S_b V_x, (..., 6), zeros where there are fewer; V: (..., n_rows, r), orthonormal."""
+    values = torch.linalg.svdvals(V[..., :6, :])
+    return nn.functional.pad(values, (0, 6 - values.shape[-1]))
 
 
 def base_rank(singular_values: Tensor) -> Tensor:
-    """rank(S_b V_x), (B,), from `base_singular_values`."""
+    """rank(S_b V_x), (...), from `base_singular_values`."""
     tolerance = max(BASE_RANK_TOLERANCE, 100.0 * torch.finfo(singular_values.dtype).eps)
-    return (singular_values > tolerance).sum(1)
+    return (singular_values > tolerance).sum(-1)
 
 
 def null_space(A: Tensor, size: float | Tensor = 1.0) -> Iterator[tuple[Tensor | slice, Tensor]]:
