@@ -16,6 +16,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 
 from torchid import parameters
 from torchid.kernels import compiled
@@ -206,10 +207,17 @@ class _Differentiable(torch.autograd.Function):
 
 def call(operator: Operator, *arguments: Any) -> Tensor:
     """Call an operator with its gradient, which `torch.func` knows of functions only, `torch.compile` of operators."""
-    if torch.compiler.is_compiling() or not torch.is_grad_enabled():
+    if torch.compiler.is_compiling() or not (torch.is_grad_enabled() and _differentiated(arguments)):
         return operator(*arguments)
     out: Tensor = _Differentiable.apply(operator, *arguments)
     return out
+
+
+def _differentiated(arguments: tuple[Any, ...]) -> bool:
+    """Whether somebody may ask for derivatives. To call the function all the same takes 40 us."""
+    if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+        return True
+    return any(isinstance(x, Tensor) and x.requires_grad for x in arguments)
 
 
 def _mapped(function: Operator, size: int, dims: Sequence[int | None], *arguments: Any) -> tuple[Tensor, int]:

@@ -183,10 +183,13 @@ def body_states(tree: KinematicTree, motion: Motion, joints: JointMotion) -> Bod
 
 def require_precision(tree: KinematicTree, tensors: Mapping[str, Tensor | None]) -> None:
     """Raise TypeError if a tensor has another dtype or device than the module."""
+    like = tree.joint_map
     for name, x in tensors.items():
+        if not isinstance(x, Tensor) or (x.dtype == like.dtype and x.device == like.device):
+            continue
         for what in ("dtype", "device"):
-            expected = getattr(tree.joint_map, what)
-            if isinstance(x, Tensor) and (actual := getattr(x, what)) != expected:
+            expected = getattr(like, what)
+            if (actual := getattr(x, what)) != expected:
                 accepted = f"{expected} (the module's {what}); convert {name}, or the module with .to({actual})"
                 raise TypeError(f"{name}: found {actual}; accepted: {accepted}")
 

@@ -59,6 +59,8 @@ class Regressor(Referenced):
     """
 
     reduction: Tensor | None
+    table: Tensor
+    reals: Tensor
 
     def __init__(
         self,
@@ -109,7 +111,7 @@ class Regressor(Referenced):
             ValueError: a shape is wrong.
         """
         samples, state = self.batch(q, v, a)
-        constants = self.get_buffer("table"), self.get_buffer("reals")
+        constants = self.table, self.reals
         if out is not None:
             K = self._memory(out, state)
             if self.runs_compiled(q):
@@ -217,7 +219,7 @@ class InverseDynamics(Referenced):
             phi = phi.reshape(samples.numel(), columns)
         inputs = (*state, phi)
         if self.runs_compiled(q):
-            constants = module.get_buffer("table"), module.get_buffer("reals")
+            constants = module.table, module.reals
             forces = call(inverse_dynamics, *inputs, *constants, *module.shape, self.number)
         else:
             forces = self.reference(*inputs)
@@ -399,6 +401,9 @@ class FrameJacobian(Referenced):
     along a cylinder's axis it is that of c. `J^T` maps the wrench of the ground, measured at c.
     """
 
+    table: Tensor
+    reals: Tensor
+
     def __init__(
         self,
         robot: Robot,
@@ -454,7 +459,7 @@ class FrameJacobian(Referenced):
             J = self._rolling(q, q.new_tensor([0.0, 0.0, 1.0]) if normal is None else normal.to(q))
         elif self.runs_compiled(q):
             shape = self.tree.n_rows, 0
-            J = call(frame_jacobian, q, self.get_buffer("table"), self.get_buffer("reals"), *shape, self.number)
+            J = call(frame_jacobian, q, self.table, self.reals, *shape, self.number)
         else:
             J = self.reference(q)
         return J.permute(2, 0, 1).reshape(*samples, *J.shape[:2])
