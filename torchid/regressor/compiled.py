@@ -44,39 +44,42 @@ def robot_tables(
             node that no column depends on.
         frames: (L, 4, 4), that the parameters are expressed in, in the nodes' joint frames.
         gravity: (3,) [m/s^2].
-        frame: node that carries one, and its pose, (4, 4), in the node's joint frame: is added as the last node.
+        frame: node that carries one, and its pose, (4, 4), in the node's joint frame: the tables then have the nodes
+            that move it and the frame as the last.
     """
     joint_map = tree.joint_map.double().cpu().numpy()
     dofs = [next(iter(np.flatnonzero(row).tolist()), -1) for row in joint_map]
+    members = range(tree.n_nodes) if frame is None else [0, *tree.path(frame[0])]
+    number = {node: place for place, node in enumerate(members)}
+
+    def row_terms(node: int) -> list[tuple[int, int, int]]:
+        """Row, node whose joint moves it (-1 for the base) and whether the next adds to the same row."""
+        joints = sorted(tree.path(node), key=lambda joint: dofs[joint])
+        more = [*(dofs[a] == dofs[b] for a, b in pairwise(joints)), False]
+        moved = [(tree.base_rows + dofs[x], number[x], int(again)) for x, again in zip(joints, more, strict=False)]
+        return [(row, -1, 0) for row in range(tree.base_rows)] + moved
+
     nodes = list[list[int]]()
     terms = list[tuple[int, int, int]]()
-    for node, own in enumerate(columns):
-        felt = _row_terms(tree, dofs, node) if own else []
+    for node in members:
+        felt = row_terms(node) if columns[node] else []
         moves = 0 <= dofs[node] < tree.n
         framed = not np.array_equal(frames[node], np.eye(4))
-        first = [max(tree.parents[node], 0), tree.slides[node], dofs[node], moves, framed, len(terms), len(felt)]
-        nodes.append([*first, *(own or _NO_COLUMNS)])
+        first = [number[max(tree.parents[node], 0)], tree.slides[node], dofs[node], moves, framed]
+        nodes.append([*first, len(terms), len(felt), *(columns[node] or _NO_COLUMNS)])
         terms += felt
-    ratios = joint_map.sum(axis=1), tree.joint_constant.double().cpu().numpy()[:, 0]
     poses = tree.T_parent_joint[:, :3].reshape(-1, 12), frames[:, :3].reshape(-1, 12)
-    reals = np.column_stack([*poses, *ratios])
+    positions = joint_map.sum(axis=1), tree.joint_constant.double().cpu().numpy()[:, 0]
+    reals = np.column_stack([*poses, *positions])[list(members)]
     if frame is not None:
-        felt = _row_terms(tree, dofs, frame[0])
-        nodes.append([frame[0], 1, -1, 0, 0, len(terms), len(felt), *_NO_COLUMNS])
+        felt = row_terms(frame[0])
+        nodes.append([number[frame[0]], 1, -1, 0, 0, len(terms), len(felt), *_NO_COLUMNS])
         terms += felt
         reals = np.vstack([reals, np.pad(frame[1][:3].ravel(), (0, reals.shape[1] - 12))])
     count = max((column + 1 for own in columns for column in own), default=0)
     table = [len(nodes), tree.n, tree.base_rows, tree.n_dofs, count, *chain(*nodes), *chain(*terms)]
     constants = [*gravity, tree.sign_width or 0.0, *reals.ravel().tolist()]
     return torch.tensor(table), torch.tensor(constants, dtype=torch.float64)
-
-
-def _row_terms(tree: KinematicTree, dofs: Sequence[int], node: int) -> list[tuple[int, int, int]]:
-    """Row, node whose joint moves it (-1 for the base) and whether the next adds to the same row, for a node's rows."""
-    joints = sorted(tree.path(node), key=lambda joint: dofs[joint])
-    follows = [dofs[a] == dofs[b] for a, b in pairwise(joints)]
-    moved = [(tree.base_rows + dofs[x], x, int(more)) for x, more in zip(joints, [*follows, False], strict=False)]
-    return [(row, -1, 0) for row in range(tree.base_rows)] + moved
 
 
 class Referenced(nn.Module):
