@@ -17,6 +17,7 @@ from motions import value
 from refusals import refusal, refused
 from repository import ROOT
 from synthetic import ROBOTS
+from urdfs import joint, link, write
 
 from torchid.cli import main
 from torchid.commands.init import init
@@ -34,8 +35,8 @@ def by_name(log: Log, names: tuple[str, ...] = ("q_{}", "dq_{}", "tau_{}")) -> d
     """Stamps, and columns by name of the joint."""
     columns: dict[str, Any] = {"t": log.time}
     for pattern, field in zip(names, FIELDS, strict=False):
-        for k, joint in enumerate(log.joint_names):
-            columns[pattern.format(joint)] = value(getattr(log, field))[:, k]
+        for k, name in enumerate(log.joint_names):
+            columns[pattern.format(name)] = value(getattr(log, field))[:, k]
     return columns
 
 
@@ -109,6 +110,29 @@ def test_wrenches_and_flags_are_those_of_the_feet_that_they_name(tmp_path: Path)
     np.testing.assert_allclose(wrench[..., :3][touching], log.contact_wrench_local[..., :3][touching], atol=1e-9)
     assert map_in(text)["contact_name"] == "{contact}_foot"
     assert any(line.startswith("contact_wrench_local: wrenches act on the robot") for line in said.assumed)
+
+
+@pytest.mark.parametrize("components", ["Fx Fy Fz Mx My Mz", "fx fy fz mx my mz"])
+def test_a_wrench_is_a_contact_of_the_link_that_its_columns_name_also_above_other_bodies(
+    tmp_path: Path, components: str
+) -> None:
+    """Feet of a person, whose toes are bodies of their own; the plates' wrenches are those of the heels."""
+    parts = [link("pelvis")]
+    columns: dict[str, Any] = {"t": 0.01 * np.arange(200)}
+    for number, side in enumerate("rl"):
+        above = "pelvis"
+        for body, hinge in (("tibia", "hip"), ("calcn", "ankle"), ("toes", "mtp")):
+            parts += [link(f"{body}_{side}"), joint(f"{hinge}_{side}", above, f"{body}_{side}")]
+            columns[f"q_{hinge}_{side}"] = np.sin(columns["t"] + number)
+            above = f"{body}_{side}"
+        for k, x in enumerate(components.split()):
+            columns[f"calcn_{side}_{x}"] = 10.0 + number + np.cos(columns["t"] + k)
+    found, _, text = initiated(save_csv(tmp_path / "x.csv", columns), write(tmp_path, *parts))
+    names = [entry["frame"] for entry in yaml.safe_load(text)["contacts"]]
+    assert sorted(names) == ["calcn_l", "calcn_r"]
+    expected = np.stack([columns[f"calcn_l_{x}"] for x in components.split()], axis=1)
+    wrench = value(found.contact_wrench_local)[:, found.contact_names.index("calcn_l")]
+    np.testing.assert_allclose(wrench, expected, atol=1e-12)
 
 
 def test_one_number_of_each_foot_is_no_flag_but_a_comment(tmp_path: Path) -> None:

@@ -61,17 +61,26 @@ def stated_contacts(sample: FileSample, robot: Robot) -> list[str]:
 
 
 def guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) -> list[GuessedContact]:
-    """Feet: links of outermost bodies with the surest word in their names, one of each body, spheres first.
+    """Links that three columns of a wrench name, and feet: outermost links with the surest word in their names.
 
-    Those that the log names, in one of its texts, count before all others.
+    Each body has one, a ball if possible. Feet that the log names count before all others. No foot is below a link with
+    a wrench.
     """
     shapes = CollisionShapes(robot)
 
-    def is_ball(name: str) -> bool:
-        return shapes.about(name, meshes=False) is not None
+    def rank(name: str) -> tuple[bool, bool, int]:
+        return shapes.about(name, meshes=False) is None, "sole" not in name.lower(), len(name)
 
-    inner = {body.parent for body in robot.bodies}
     texts = [text.lower() for text in texts if not re.search(_IN_LIMBS, text, re.IGNORECASE)]
+    moving = sorted((name for name, (body, _) in robot.links.items() if body), key=len, reverse=True)
+    forces = [text for text in texts if propose_field(text) in WRENCHES]
+    columns = Counter(next((name for name in moving if within(name.lower()).search(text)), "") for text in forces)
+    wrenches = [name for name in robot.links if columns[name] > 2]
+    inner = {robot.links[name][0] for name in wrenches}
+    parents = [body.parent for body in robot.bodies]
+    for number, parent in enumerate(parents):
+        inner |= {number} if parent in inner else set()
+    inner |= {*parents}
     named = [name for name in robot.links if any(within(name.lower()).search(text) for text in texts)]
     frames = list(stated)
     for words, links in ((_NAMED, named), *((words, list(robot.links)) for words in _FEET)) if not frames else ():
@@ -81,16 +90,10 @@ def guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) ->
             is_foot = re.search(words, name, re.IGNORECASE)
             if body and body not in inner and is_foot and not re.search(_ON_FEET, name, re.IGNORECASE):
                 by_body.setdefault(body, []).append(name)
-        frames = [
-            min(
-                names,
-                key=lambda name: (not is_ball(name), "sole" not in name.lower(), len(name)),
-            )
-            for names in by_body.values()
-        ]
-        if len(frames) > 1:
+        frames = [*wrenches, *(min(names, key=rank) for names in by_body.values())]
+        if len(frames) > max(len(wrenches), 1):
             break
-        frames = []
+        frames = wrenches
     frames = frames or _balls_of_limbs(robot, shapes)
     flat = len(frames) < 3
     return [GuessedContact(x, "flat" if flat and shapes.about(x) is None else "point") for x in frames]

@@ -36,7 +36,7 @@ from torchid.proposals.names import (
 )
 from torchid.proposals.samples import FileSample, increases, numbers_of, slope_fit, stated_names
 
-_AXIS = re.compile(r"(?:(?<![A-Za-z])[a-z]?([wxyz])|(?:(?<![A-Za-z])[A-Z]?|(?<=[a-z]))([WXYZ]))(?![A-Za-z0-9])")
+_AXIS = re.compile(r"(?:(?<![A-Za-z])[A-Za-z]?([wxyz])|(?:(?<![A-Za-z])[A-Z]?|(?<=[a-z]))([WXYZ]))(?![A-Za-z0-9])")
 _LAST_NUMBER = re.compile(r"\d+(?!.*\d)")
 _OF_JOINTS = {
     "position": "joint_position", "velocity": "joint_velocity", "angular velocity": "joint_velocity",
@@ -183,7 +183,7 @@ def _parts(text: str, spelled: Mapping[str, Spelling]) -> dict[str, Any]:
     if axes := list(_AXIS.finditer(PLACEHOLDER.sub(lambda x: "\0" * len(x[0]), stem))):
         axis = axes[-1][1] or axes[-1][2]
         place = axes[-1].end() - 1
-        before, inner = split_unit(stem[:place].rstrip("_./ "))
+        before, inner = split_unit(PLACEHOLDER.sub(" ", stem[:place]).rstrip("_./ "))
         stem = f"{stem[:place]}{{{'axis' if axis.islower() else 'AXIS'}}}{stem[place + 1 :]}"
         words = [re.sub(r"^([a-z])[wxyz]$", r"\1x", x) for x in words if not re.fullmatch("[wxyz]", x)]
         if inner and not unit and quantity_of(join_pairs(words_of(before))):  # of acc_g.x
