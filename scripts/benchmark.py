@@ -7,7 +7,9 @@ start from the arrays of a log and end with parameters. Sensors are `joints` (to
 feet are in contact in two thirds of the samples. Consistent parameters are timed on noisy data of Solo12 that were
 generated with other, physically consistent parameters.
 
-With `--device cuda` torchid's part runs on a GPU, the per-sample pipelines on the CPU as ever. A second table has the
+The modules for training loops are timed on one thread beside Pinocchio and NumPy called sample by sample, see
+`scripts/modules.py`. With `--device cuda` torchid's part of the fits runs on a GPU, the per-sample pipelines on the CPU
+as ever. A second table has the
 stages of the compression beside their floors, see `scripts/stages.py`.
 """
 
@@ -25,6 +27,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import torch
+from modules import ModuleCase, module_rows
 from rich.console import Console
 from rich.table import Table
 from stages import Limits, Stages, measure_stages, stage_table, synchronize
@@ -282,6 +285,35 @@ def measure(
     return measured, measure_stages(builder, by_stages, limits)
 
 
+def module_table(repeats: int) -> Table:
+    """Times of the modules of two robots and their shares of the peers'; calls of small batches are repeated."""
+    names = [case for case in CASES if case.name != "Alexander legs"]
+    works = dict[str, tuple[Callable[[], object], int]]()
+    for case in names:
+        urdf = robots_folder() / case.urdf
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TorchidWarning)
+            timed = ModuleCase(load_robot(urdf), str(urdf), case.feet, 3 if case.kind == "point" else 6)
+        for name, (work, samples) in timed.works().items():
+            calls = max(1, 256 // samples)
+            works[f"{case.name} {name}"] = partial(repeat, work, calls), samples * calls
+    measured = medians(works, repeats)
+    table = Table(title="Modules on one thread: microseconds per sample, and share of Pinocchio's or NumPy's time")
+    for column in ("", *(case.name for case in names), "bar"):
+        table.add_column(column, justify="right" if column else "left")
+    rows = [module_rows({name: measured[f"{case.name} {name}"] for name in timed.works()}) for case in names]
+    for of_robots in zip(*rows, strict=True):
+        (title, _, _, bar) = of_robots[0]
+        table.add_row(title, *(f"{time:.3g}; {share:.2f}" for _, time, share, _ in of_robots), f"{bar}")
+    return table
+
+
+def repeat(work: Callable[[], object], calls: int) -> None:
+    """Call something often."""
+    for _ in range(calls):
+        work()
+
+
 def main() -> None:
     """Measure all robots and print one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -314,6 +346,10 @@ def main() -> None:
     console.print(f"products of matrices: {blas_kernels()}")
     console.print(stage_table(stages, limits, device))
     console.print(consistent)
+    if device.type == "cpu":
+        torch.set_num_threads(1)
+        with ThreadpoolController().limit(limits=1):
+            console.print(module_table(arguments.repeats))
 
 
 if __name__ == "__main__":

@@ -139,40 +139,35 @@ template <class T> V<T> gather(const T *from, Index step, Index count) {
   return out;
 }
 
-template <class T> bool any(const V<T> &x) {  // whether bits are set: -0 and NaN count
-  uint64_t words[8], out = 0;
-  std::memcpy(words, &x, sizeof words);
+template <class T> bool any(const V<T> *x) {  // whether bits of a row of X are set: -0 and NaN count
+  constexpr Index WORDS = LANES<T> * sizeof(V<T>) / sizeof(uint64_t);
+  uint64_t words[WORDS], out = 0;
+  std::memcpy(words, x, sizeof words);
   for (uint64_t word : words) out |= word;
   return out;
 }
 
-// Products of a basis, m columns, with a vector x
+// Products of a basis, m columns, with some vectors X, (m, N): (m, N). Rows of zeros, of which K has many, are left out.
 template <class T>
-void multiply(const std::vector<V<T>> &W, const std::vector<V<T>> &x, std::vector<Index> &rows, V<T> *out, Index step) {
-  constexpr Index BLOCK = 8;
-  const Index m = Index(x.size());
+void multiply(const std::vector<V<T>> &W, const std::vector<V<T>> &X, std::vector<Index> &rows, std::vector<V<T>> &out) {
+  constexpr Index N = LANES<T>;
+  const Index m = Index(rows.size());
   Index n = 0;
   for (Index c = 0; c < m; ++c)
-    if (any<T>(x[c])) rows[n++] = c;
-  for (Index j = 0; j < m; j += BLOCK) {
-    V<T> sums[BLOCK] = {};
-    const Index width = std::min(BLOCK, m - j);
-    if (width == BLOCK) {
-      for (Index r = 0; r < n; ++r)
-        for (Index b = 0; b < BLOCK; ++b) sums[b] += W[rows[r] * m + j + b] * x[rows[r]];
-    } else {
-      for (Index r = 0; r < n; ++r)
-        for (Index b = 0; b < width; ++b) sums[b] += W[rows[r] * m + j + b] * x[rows[r]];
-    }
-    for (Index b = 0; b < width; ++b) out[(j + b) * step] = sums[b];
+    if (any<T>(&X[c * N])) rows[n++] = c;
+  for (Index j = 0; j < m; ++j) {
+    V<T> sums[N] = {};
+    for (Index r = 0; r < n; ++r)
+      for (Index k = 0; k < N; ++k) sums[k] += W[rows[r] * m + j] * X[rows[r] * N + k];
+    for (Index k = 0; k < N; ++k) out[j * N + k] = sums[k];
   }
 }
 
 template <class T> void project(const Project<T> &p, Index begin, Index end) {
   constexpr Index N = LANES<T>;
-  const Index m = p.m;
+  const Index m = p.m, joints = p.rows - p.base;
   std::vector<std::vector<V<T>>> bases(GROUPS, std::vector<V<T>>(m * m));
-  std::vector<V<T>> x(m), products(m * N);
+  std::vector<V<T>> X(m * N), products(m * N);
   std::vector<Index> rows(m);
   const T *made = reinterpret_cast<const T *>(products.data());
   for (Index start = begin; start < end; start += GROUPS * N) {
@@ -182,31 +177,33 @@ template <class T> void project(const Project<T> &p, Index begin, Index end) {
       const Contact<T> contact{p, first, count};
       null_basis(contact, bases[g], p.suspect + first);
       if (p.wrench_std) whiten(contact, bases[g]);
+      std::fill(X.begin(), X.end(), V<T>{});
       for (Index c = 0; c < m; ++c) {
         for (Index s = 0; s < count; ++s)
           for (Index j = 0; j < m; ++j) p.V[((first + s) * p.rows + p.kept[c]) * m + j] = bases[g][c * m + j][s];
-        const Index joints = p.rows - p.base, joint = p.kept[c] - p.base;
-        x[c] = joint < 0 ? V<T>{} : gather(p.torque + first * joints + joint, joints, count);
+        V<T> &force = X[c * N];
+        if (p.kept[c] >= p.base) force = gather(p.torque + first * joints + p.kept[c] - p.base, joints, count);
         for (Index i = 0; i < p.n_measured; ++i) {
           const V<T> push = gather(p.wrench + first * p.k + p.measured[i], p.k, count);
           const V<T> J = contact.at(p.measured[i], p.kept[c]);
-          for (Index s = 0; s < count; ++s) x[c][s] += J[s] == 0 ? 0 : J[s] * push[s];  // what is not read may be NaN
+          for (Index s = 0; s < count; ++s) force[s] += J[s] == 0 ? 0 : J[s] * push[s];  // what is not read may be NaN
         }
       }
-      multiply<T>(bases[g], x, rows, products.data(), 1);
+      multiply<T>(bases[g], X, rows, products);
       for (Index s = 0; s < count; ++s)
-        for (Index j = 0; j < m; ++j) p.f[(first + s) * m + j] = made[j * N + s];
+        for (Index j = 0; j < m; ++j) p.f[(first + s) * m + j] = made[j * N * N + s];
     }
     for (Index column = 0; column < p.columns; column += N)
       for (Index g = 0; g < used; ++g) {
         const Index first = start + g * N, count = std::min(N, end - first), width = std::min(N, p.columns - column);
-        for (Index k = 0; k < width; ++k) {
-          const T *K = p.K + first * p.K_sample + (column + k) * p.K_column;
-          if (column + k + N < p.columns && p.K_sample == 1)
-            for (Index c = 0; c < m; ++c) __builtin_prefetch(K + p.kept[c] * p.K_row + N * p.K_column);
-          for (Index c = 0; c < m; ++c) x[c] = gather(K + p.kept[c] * p.K_row, p.K_sample, count);
-          multiply<T>(bases[g], x, rows, &products[k], N);
+        for (Index c = 0; c < m; ++c) {
+          const T *K = p.K + first * p.K_sample + p.kept[c] * p.K_row + column * p.K_column;
+          for (Index k = 0; k < width; ++k, K += p.K_column) {
+            X[c * N + k] = gather(K, p.K_sample, count);
+            __builtin_prefetch(K + N * p.K_column);
+          }
         }
+        multiply<T>(bases[g], X, rows, products);
         for (Index s = 0; s < count; ++s)  // whole lines of memory at a time
           for (Index j = 0; j < m; ++j) {
             T *to = p.K_out + ((first + s) * m + j) * p.columns + column;
