@@ -3,7 +3,6 @@
     python scripts/default_accuracy.py make --seed 1 --output robots            # all robots; or --robots panda go2_walk
     python scripts/default_accuracy.py judge robots                             # defaults
     python scripts/default_accuracy.py judge robots -- estimator.ridge=0.1      # other settings
-    python scripts/default_accuracy.py best robots                              # the best of a grid, the truth in hand
 
 `make` writes a folder for each robot: `robot.urdf`, whose bodies are some 20 % off the true ones (`true.urdf`),
 `log.csv` and `other.csv`, another motion, with the flaws of real logs, and `truth.json`. `judge` fits `log.csv` and
@@ -14,18 +13,32 @@ of the rigid bodies in random states, by limb; masses. Needs the extra `[oracle]
 from __future__ import annotations
 
 import argparse
+import tempfile
 from pathlib import Path
 
-from defaults.judging import judge_all, print_results, search_all
+from defaults.judging import judge, print_results
 from defaults.making import make
 from defaults.robots import CASES
+from markdown_table import Rows
 
 from torchid.boundary import run_guarded
 from torchid.errors import InputError
 
 
+def ridge_table(name: str = "panda", seed: int = 1) -> Rows:
+    """Errors of an arm by ridge: torques of the unseen motion, and masses of its links."""
+    yield ["`estimator.ridge`", "torque error", "masses of links / true ones"]
+    with tempfile.TemporaryDirectory() as folder:
+        make(name, seed, Path(folder))
+        for ridge in ("1e-6", "1e-3", "0.1", "1", "auto"):
+            score = judge(Path(folder, name), [f"estimator.ridge={ridge}"], Path(folder)).score
+            if score is not None:
+                masses = [identified for identified, _ in score.masses.values()]
+                yield [ridge, f"{100.0 * score.torque:.1f} %", f"{min(masses):.2f} to {max(masses):.2f}"]
+
+
 def run(options: argparse.Namespace) -> None:
-    """Make, judge or search."""
+    """Make or judge."""
     if options.command == "make":
         for name in options.robots or CASES:
             truth = make(name, options.seed, options.output)
@@ -35,8 +48,8 @@ def run(options: argparse.Namespace) -> None:
     folders = [one for one in folders if not options.robots or one.name in options.robots]
     if not folders:
         raise InputError("arguments", "folder", f"no robot in {options.folder}", "a folder that make has written")
-    work = judge_all if options.command == "judge" else search_all
-    print_results(work(folders, options.overrides, options.work or options.folder), options.json)
+    work = options.work or options.folder
+    print_results((judge(folder, options.overrides, work) for folder in folders), options.json)
 
 
 def main() -> int:
@@ -47,13 +60,12 @@ def main() -> int:
     maker.add_argument("--seed", type=int, default=1)
     maker.add_argument("--output", type=Path, required=True)
     maker.add_argument("--robots", nargs="+", choices=list(CASES))
-    for name in ("judge", "best"):
-        judge = commands.add_parser(name)
-        judge.add_argument("folder", type=Path)
-        judge.add_argument("overrides", nargs="*", help="behind --: key=value of the experiment file")
-        judge.add_argument("--robots", nargs="+", choices=list(CASES))
-        judge.add_argument("--json", type=Path, help="results as JSON")
-        judge.add_argument("--work", type=Path, help="where runs are written, by default beside the robots")
+    judger = commands.add_parser("judge")
+    judger.add_argument("folder", type=Path)
+    judger.add_argument("overrides", nargs="*", help="behind --: key=value of the experiment file")
+    judger.add_argument("--robots", nargs="+", choices=list(CASES))
+    judger.add_argument("--json", type=Path, help="results as JSON")
+    judger.add_argument("--work", type=Path, help="where runs are written, by default beside the robots")
     options = parser.parse_args()
     return run_guarded("default_accuracy", lambda: run(options))
 

@@ -1,36 +1,23 @@
-"""Are samples of a posterior those of the posterior? Means and covariances against long chains of another kind.
-
-    python scripts/posterior_accuracy.py                       # UR5, Solo12 and G1
-    python scripts/posterior_accuracy.py --quick               # UR5 alone, shorter chains
-    python scripts/posterior_accuracy.py --prior-error 0.4 --robots Solo12
+"""Synthetic posteriors, and whether their samples have the moments of long chains of another kind.
 
 A robot whose parameters are up to 20 % off its URDF, with friction in half of its joints, is seen in random motions in
-which a base that floats stands on one foot or more; joint torques have noise. Compared are 40 000 samples with
-hit-and-run chains (`long_chain.py`): the largest and the rms difference of means, in standard deviations, of standard
-deviations, as a share, and of correlations, over all parameters; and how much of each such difference chance explains
-(two halves of the long chains). Needs the package example-robot-data (extra `[oracle]`).
+which a base that floats stands on one foot or more; joint torques have noise. The chains are hit-and-run chains
+(`long_chain.py`). Needs the package example-robot-data (extra `[oracle]`).
 """
 
 from __future__ import annotations
 
-import argparse
 import sysconfig
-import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from long_chain import LongChain
-from rich.console import Console
-from rich.table import Table
 
-from torchid.boundary import run_guarded
 from torchid.errors import TorchidWarning
 from torchid.estimators import Conditions
 from torchid.estimators.posterior import Posterior, whitened_rows
-from torchid.estimators.truncated_gaussian import TruncatedGaussian
 from torchid.identifiability.base_parameters import structural_samples
 from torchid.parallel import one_thread
 from torchid.parameters import FRICTION, Array, perturb_parameters
@@ -95,52 +82,3 @@ def long_run(posterior: Posterior, prior_error: float, sweeps: int, chains: int)
     chain.run(sweeps // 5 * steps)
     chain.run(sweeps * steps, lambda x: states.append(x.astype(np.float32)), every=steps)
     return np.concatenate(states).astype(np.float64)
-
-
-def compare(name: str, options: argparse.Namespace) -> list[str]:
-    """One row of the table."""
-    posterior = Synthetic(name, options.seed).posterior(0)
-    conic = posterior.conic_problem(options.prior_error)
-    start = time.process_time()
-    sampler = TruncatedGaussian(conic, posterior.owners())
-    prepared = time.process_time() - start
-    start = time.process_time()
-    sampler.draw(10_000, torch.Generator().manual_seed(1))
-    seconds = time.process_time() - start
-    draws = sampler.draw(_SAMPLES, torch.Generator().manual_seed(0)).numpy()
-    sweeps = options.sweeps // (10 if options.quick else 1)
-    states = long_run(posterior, options.prior_error, sweeps, options.chains)
-    half = len(states) // 2
-    found, chance = differences(draws, states), differences(states[:half], states[half:])
-    texts = [f"{found[x][0]:.3f} ({found[x][1]:.3f}); {chance[x][0]:.3f}" for x in found]
-    near = f"{sampler.near} of {sampler.conditions}"
-    kind = "-" if sampler.chains is None else f"{sampler.chains.passes} {sampler.chains.moves}"
-    return [name, f"{len(conic.linear)}", near, kind, *texts, f"{prepared:.2f} + {seconds:.2f}"]
-
-
-def run(options: argparse.Namespace) -> None:
-    """Compare and print."""
-    table = Table(title="samples against long chains: largest (rms) difference; largest between halves of the chains")
-    for name in ("robot", "n", "near", "passes", "mean / sd", "sd", "correlation", "CPU s: prepare + 10 000"):
-        table.add_column(name, no_wrap=True)
-    console = Console(width=150)
-    for name in ["UR5"] if options.quick else options.robots:
-        table.add_row(*compare(name, options))
-        console.print(table)
-
-
-def main() -> int:
-    """Read the arguments."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="UR5 alone, a tenth of the sweeps")
-    parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
-    parser.add_argument("--prior-error", type=float, default=0.2)
-    parser.add_argument("--chains", type=int, default=200)
-    parser.add_argument("--sweeps", type=int, default=300, help="of the long chains")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    return run_guarded("posterior_accuracy", lambda: run(options))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

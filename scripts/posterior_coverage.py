@@ -1,7 +1,7 @@
 """Do 95 % credible intervals hold the truth in 95 % of cases? The same motion, with new noise again and again.
 
-    python scripts/posterior_coverage.py                        # 200 repetitions of UR5, Solo12 and G1
-    python scripts/posterior_coverage.py --quick                # 20 repetitions of UR5
+    python scripts/posterior_coverage.py                                   # UR5, Solo12 and G1
+    python scripts/posterior_coverage.py --repetitions 20 --robots UR5
 
 The robots and motions of `posterior_accuracy.py`, with friction in all joints: no interval holds a friction that is 0.
 In each repetition torques have new noise, and 1000 samples give the interval from the 2.5th to the 97.5th percentile of
@@ -12,14 +12,13 @@ vectors of the rows in units of the prior.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
+from markdown_table import Rows, print_table
 from posterior_accuracy import ROBOTS, Synthetic
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
 
 from torchid.boundary import run_guarded
 from torchid.estimators.truncated_gaussian import TruncatedGaussian
@@ -49,36 +48,23 @@ def _inside(draws: Array, truth: Array) -> Array:
     return (low <= truth) & (truth <= high)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Repeat, count, print."""
-    table = Table(title="coverage of 95 % credible intervals [%]")
-    for name in ("robot", "repetitions", "combinations", "average", "5th percentile of them"):
-        table.add_column(name)
-    repetitions = 20 if options.quick else options.repetitions
-    console = Console(width=120)
-    with Progress(console=Console(stderr=True), transient=True) as bars:
-        for name in ["UR5"] if options.quick else options.robots:
-            bar, one = bars.add_task(name, total=repetitions), Synthetic(name, options.seed, rough=1.0)
-            found = []
-            for repetition in range(repetitions):
-                found.append(covered(one, repetition, options.prior_error))
-                bars.advance(bar)
-            share = 100.0 * np.mean(found, axis=0)
-            texts = f"{len(share)}", f"{share.mean():.1f}", f"{np.quantile(share, 0.05):.1f}"
-            table.add_row(name, f"{repetitions}", *texts)
-    console.print(table)
+def posterior_table(repetitions: int = 200, robots: Sequence[str] = tuple(ROBOTS), prior_error: float = 0.2) -> Rows:
+    """Coverage by robot."""
+    yield ["robot", "combinations", "average [%]", "5th percentile of them [%]"]
+    for name in robots:
+        robot = Synthetic(name, 0, rough=1.0)
+        share = 100.0 * np.mean([covered(robot, number, prior_error) for number in range(repetitions)], axis=0)
+        yield [name, f"{len(share)}", f"{share.mean():.1f}", f"{np.quantile(share, 0.05):.1f}"]
 
 
 def main() -> int:
     """Read the arguments."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="20 repetitions of UR5")
     parser.add_argument("--repetitions", type=int, default=200)
     parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
     parser.add_argument("--prior-error", type=float, default=0.2)
-    parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    return run_guarded("posterior_coverage", lambda: run(options))
+    return run_guarded("posterior_coverage", lambda: print_table(posterior_table(**vars(options))))
 
 
 if __name__ == "__main__":

@@ -9,24 +9,17 @@ import subprocess
 import sys
 import textwrap
 import time
-import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import redirect_stderr
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from defaults.scoring import Score, Terms, Truth, median_mass_error
-from torchid.commands.identify import identify
-from torchid.config import load_config
-from torchid.errors import TorchidError
 
 _SECONDS = 1200
 _ENVIRONMENT = {"COLUMNS": "100", "NO_COLOR": "1", "OMP_NUM_THREADS": "1"}
-_CUTOFFS, _RIDGES = (4.0, 7.0, 12.0, 20.0), (1e-3, 1e-2, 0.1, 1.0)
 
 
 @dataclass
@@ -53,7 +46,6 @@ class Result:
     terms: str = ""
     mass: tuple[float | None, float | None] | None = None
     own: tuple[float | None, float | None] | None = None
-    best: tuple[float, str] | None = None
 
     def failures(self) -> list[str]:
         """What the defaults are not to do."""
@@ -69,19 +61,11 @@ class Result:
         mass, deviation = self.mass or (None, None)
         if mass is not None and deviation is not None and not self.truth["held"]:
             out += ["mass beyond 2 s.e."] * (abs(mass - self.truth["total_mass"]) > 2.0 * deviation)
-        if self.best is not None and score.both > 1.15 * self.best[0]:
-            out.append(f"{score.both / self.best[0]:.2f} x the best")
         return out
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON has it."""
         return vars(self) | {"score": None if self.score is None else self.score.as_dict(), "failures": self.failures()}
-
-
-def judge_all(folders: Iterable[Path], overrides: Sequence[str], work: Path) -> Iterator[Result]:
-    """Judge robots one after the other."""
-    for folder in folders:
-        yield judge(folder, overrides, work)
 
 
 def judge(folder: Path, overrides: Sequence[str], work: Path) -> Result:
@@ -164,67 +148,6 @@ def describe_terms(config: Mapping[str, Any]) -> str:
     return ", ".join([*out, *[f"margin {margin} s"] * bool(margin)])
 
 
-def search_all(folders: Iterable[Path], overrides: Sequence[str], work: Path) -> Iterator[Result]:
-    """Judge robots, and search the settings that are best for each, the truth in hand."""
-    for folder in folders:
-        result = judge(folder, (), work)
-        result.best = search(folder, overrides, work)
-        yield result
-
-
-def search(folder: Path, overrides: Sequence[str], work: Path) -> tuple[float, str] | None:
-    """The least errors of forces over the URDF's by cutoff, then by ridge, then by terms, and their settings."""
-    truth, experiment, tried = Truth(folder), work / f"{folder.name}.yaml", dict[tuple[str, ...], float]()
-    fixed = (*truth.known["edit"], *overrides)
-
-    def least(candidates: Iterable[tuple[str, ...]]) -> tuple[str, ...]:
-        found = {}
-        for one in candidates:
-            found[one] = tried[one] if one in tried else _scored(experiment, truth, (*fixed, *one), work)
-        tried.update(found)
-        return min(found, key=lambda x: found[x])
-
-    terms, ridge = _right_terms(truth), "estimator.ridge=0.1"
-    cutoff = least((f"preprocessing.cutoff_hz={hz}", ridge, *terms) for hz in _CUTOFFS)[0]
-    ridge = least((cutoff, f"estimator.ridge={x}", *terms) for x in _RIDGES)[1]
-    alternatives = [terms, (), (*terms, "actuators.sign_width=auto"), tuple(x for x in terms if "stiction" not in x)]
-    if truth.known["ball"]:
-        alternatives.append((*terms, f"contacts={_rolling(truth)}"))
-    best = least((cutoff, ridge, *one) for one in dict.fromkeys(alternatives))
-    return (tried[best], " ".join(best)) if tried[best] < float("inf") else None
-
-
-def _rolling(truth: Truth) -> str:
-    """Contacts of balls with their radius, about the frames' origins."""
-    radius = truth.known["ball"]["radius"]
-    entries = (f"{{frame: {foot}, type: point, radius: {radius}}}" for foot in truth.known["feet"])
-    return f"[{', '.join(entries)}]"
-
-
-def _right_terms(truth: Truth) -> tuple[str, ...]:
-    """Settings of the terms that the true robot has."""
-    known, out = truth.known, []
-    out += ["actuators.armature=true"] * (max(known["armature"]) > 0.0)
-    out += ["actuators.torque_offset=true"] * any(known["offset"])
-    out += [f"actuators.delay={known['delay']:.6f}"] * (known["delay"] > 0.0)
-    out += ["actuators.stiction=true"] * known["simulator"].startswith("MuJoCo")
-    out += ["preprocessing.contact_margin_s=0.06"] * (known["simulator"].startswith("MuJoCo") and not known["held"])
-    return tuple(out)
-
-
-def _scored(experiment: Path, truth: Truth, overrides: Sequence[str], work: Path) -> float:
-    """Errors over the URDF's; infinite of a fit that is refused."""
-    try:
-        with warnings.catch_warnings(), redirect_stderr(StringIO()):
-            warnings.simplefilter("ignore")
-            run = identify(load_config(experiment, overrides, {"output": None}))
-            document = run.to_dict()
-            urdf = run.to_urdf(work / f"{truth.folder.name}_tried.urdf", overwrite=True)
-    except TorchidError:
-        return float("inf")
-    return truth.score(urdf, _terms(document["parameters"], document["config"])).both
-
-
 def print_results(results: Iterable[Result], file: Path | None) -> None:
     """A block of 80 columns for each robot, at once; and all as JSON."""
     every = []
@@ -267,8 +190,6 @@ def _block(result: Result) -> str:
     said.append(f"the true robot leaves {100 * (result.least or 0.0):.1f} % of the torques")
     if result.own is not None:
         said.append("other.csv by evaluate, identified and URDF: {1} and {0} N m".format(*map(_short, result.own)))
-    if result.best is not None and score is not None:
-        said.append(f"both {score.both:.3f}, best {result.best[0]:.3f}: {result.best[1]}")
     said += ["FAILS: " + ", ".join(result.failures())] * bool(result.failures())
     for text in said:
         lines += [f"    {part}" for part in textwrap.wrap(text, 76, subsequent_indent="  ")]

@@ -102,14 +102,6 @@ class Score:
         """The least."""
         return min((found, name) for name, (found, _) in self.masses.items())
 
-    @property
-    def both(self) -> float:
-        """Of joints and base, over the URDF's: what the best settings are chosen by."""
-        shares = [self.torque / self.urdf_torque]
-        if self.force is not None and self.urdf_force:
-            shares.append(self.force / self.urdf_force)
-        return float(np.exp(np.mean(np.log(shares))))
-
     def as_dict(self) -> dict[str, Any]:
         """As JSON has it."""
         return asdict(self)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import redirect_stderr
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 
@@ -16,12 +15,10 @@ import yaml
 from legged.errors import ParameterErrors, parameter_errors
 from legged.gait import Reference
 from legged.recording import Noise, record
-from legged.robots import ROBOTS, Legged, TrueRobot
+from legged.robots import Legged, TrueRobot
 from legged.simulate import Exact, simulated
 from torchid.commands.identify import identify
-from torchid.commands.run_folder import Identification
 from torchid.config import load_config
-from torchid.errors import TorchidError
 from torchid.logs import Log, write_log
 
 SIGNALS = ("exact", "sampled", "noisy")
@@ -33,19 +30,23 @@ NO_NOISE = Noise().times(0.0, 0.0)
 
 @dataclass(frozen=True)
 class Feet:
-    """How feet touch the ground in the simulation, and what torchid takes them for."""
+    """How feet touch the ground in the simulation, and the radius [m] that the experiment file states for them."""
 
     name: str
     rolling: bool
-    assumed_rolling: bool
+    radius: float | str | None = None
 
 
-BALL_AS_POINT, BALL, POINT, FLAT = (
-    Feet("ball feet, as points", True, False),
-    Feet("ball feet", True, True),
-    Feet("point feet", False, False),
-    Feet("flat feet", True, True),
-)
+FEET = {
+    "point": (
+        Feet("point feet", False, 0.0),
+        Feet("ball feet", True),
+        Feet("ball feet, `radius: auto`", True, "auto"),
+        Feet("ball feet, `radius: 0`", True, 0.0),
+    ),
+    "flat": (Feet("flat feet", True),),
+}
+"""Feet to try, by the kind of a robot's contacts."""
 
 
 @dataclass(frozen=True)
@@ -60,26 +61,12 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of it.
+    """What came of it: total mass [kg], rms errors of joint torques on the unseen log [N m]."""
 
-    `forces`: rms errors on the unseen log by group of rows, of the URDF and of the identified parameters; `refused`:
-    the message, where torchid refuses the fit.
-    """
-
-    robot: str
-    feet: str
-    signals: str
-    sensors: str
+    errors: ParameterErrors
     true_mass: float
-    urdf_mass: float
-    errors: ParameterErrors | None = None
-    mass_error: float | None = None
-    identified: int = 0
-    residual: float | None = None
-    forces: dict[str, tuple[float | None, float | None]] | None = None
-    verdict: str | None = None
-    seconds: float = 0.0
-    refused: str | None = None
+    torque_error: float
+    urdf_torque_error: float
 
 
 class Simulated:
@@ -135,47 +122,22 @@ def experiment(case: Case, one: Simulated, contacts: list[dict[str, object]]) ->
 
 def contact_entries(case: Case, legged: Legged) -> list[dict[str, object]]:
     """`contacts` of the experiment file."""
-    entries: list[dict[str, object]] = [{"frame": foot, "type": legged.kind} for foot in legged.feet]
-    if legged.kind == "point":
-        entries = [entry | {"radius": legged.radius if case.feet.assumed_rolling else 0.0} for entry in entries]
-    return entries
+    radius = legged.radius if case.feet.radius is None else case.feet.radius
+    stated = {"radius": radius} if legged.kind == "point" else {}
+    return [{"frame": foot, "type": legged.kind, **stated} for foot in legged.feet]
 
 
 def examine(case: Case, one: Simulated, overrides: Sequence[str]) -> Outcome:
     """Identify and compare with the truth."""
     true, path = one.true, one.folder / "experiment.yaml"
     path.write_text(yaml.safe_dump(experiment(case, one, contact_entries(case, one.legged))))
-    masses = float(true.phi[:, 0].sum()), float(true.robot.nominal[:, 0].sum())
-    outcome = Outcome(case.robot, case.feet.name, case.signals, case.sensors, *masses)
-    start = time.process_time()
-    try:
-        with warnings.catch_warnings(), redirect_stderr(StringIO()):
-            warnings.simplefilter("ignore")
-            run = identify(load_config(path, [*overrides, "overwrite=true"]))
-    except TorchidError as error:
-        return replace(outcome, refused=str(error))
-    return replace(_filled(outcome, true, run), seconds=time.process_time() - start)
-
-
-def _filled(outcome: Outcome, true: TrueRobot, run: Identification) -> Outcome:
-    pair = run.metrics["test"]
-    return replace(
-        outcome,
-        errors=parameter_errors(true, run.phi),
-        mass_error=run.mass.standard_error,
-        identified=run.estimate.rank,
-        residual=run.estimate.residual_std,
-        forces={group: (pair.nominal.rms.get(group), pair.identified.rms.get(group)) for group in GROUPS},
-        verdict="; ".join(f"{x}" for x in run.worse) or None,
+    with warnings.catch_warnings(), redirect_stderr(StringIO()):
+        warnings.simplefilter("ignore")
+        run = identify(load_config(path, [*overrides, "overwrite=true"]))
+    test = run.metrics["test"]
+    return Outcome(
+        parameter_errors(true, run.phi),
+        float(true.phi[:, 0].sum()),
+        test.identified.rms["joint_torque"] or 0.0,
+        test.nominal.rms["joint_torque"] or 0.0,
     )
-
-
-def cases(robots: Sequence[str], signals: Sequence[str], sensors: Sequence[str]) -> Iterator[Case]:
-    """All combinations that there are."""
-    for robot in robots:
-        feet: tuple[Feet, ...] = (FLAT,)
-        if ROBOTS[robot].kind == "point":
-            feet = (POINT, BALL_AS_POINT, BALL)
-        for one in feet:
-            for signal in signals:
-                yield from (Case(robot, one, signal, chosen) for chosen in sensors)

@@ -21,7 +21,6 @@ from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.noise import estimate_noise, misfit, unfitted_friction
 from torchid.fitting.robust import RobustLoss, fit_robustly
 from torchid.identifiability.confounding import ParameterCovariance, total_mass
-from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import FRICTION, MASS, PER_BODY, Array
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
@@ -31,7 +30,7 @@ from torchid.sensing import SensorNoise, named_sensors
 
 NORMAL = 1.959964
 _SPARSE = 5  # of exact signals every so many samples are fitted: 100 Hz
-_CUTOFF, _RATE = 20.0, 100.0  # Hz
+_RATE = 100.0  # Hz
 _OFFSET = 0.5  # N m, standard deviation
 _OUTLIERS, _OUTLYING = 0.01, 20.0  # share of the readings, and by how much their noise is larger
 
@@ -42,53 +41,42 @@ class Situation:
 
     Attributes:
         name: for tables.
-        filtered: positions, orientation and IMU are recorded and filtered; else exact rates of the same instants are.
+        cutoff: with which positions, orientation and IMU are filtered [Hz]; else exact rates of the same instants are
+            recorded.
         motion: noise of positions, orientation and IMU, in usual ones.
         walked: in MuJoCo, with impacts; else feet take their load within a tenth of a second.
-        steps, coulomb: whether feet are lifted, and joints have Coulomb friction.
         offsets, outliers, robust, friction: unknown torque offsets; one reading in a hundred is far off; Huber's loss;
             whether friction is fitted.
-        level: of friction, times the usual.
     """
 
     name: str
-    filtered: bool = False
+    cutoff: float | None = None
     motion: float = 0.0
     walked: bool = False
-    steps: bool = True
-    coulomb: bool = True
     offsets: bool = False
     outliers: bool = False
     robust: bool = False
     friction: bool = True
-    level: float = 1.0
 
 
 SITUATIONS = (
-    Situation("torque noise"),
-    Situation("filtered, smooth", filtered=True, steps=False, coulomb=False),
-    Situation("motion noise, smooth", filtered=True, motion=1.0, steps=False, coulomb=False),
-    Situation("filtered, switches, Coulomb", filtered=True),
-    Situation("motion noise, switches, Coulomb", filtered=True, motion=1.0),
-    Situation("walked in MuJoCo, motion noise", filtered=True, motion=1.0, walked=True),
-    Situation("unknown offsets", offsets=True),
-    Situation("outliers, robust loss", outliers=True, robust=True),
-    Situation("friction not fitted, x 0.3", filtered=True, friction=False, level=0.3),
-    Situation("friction not fitted, x 1", filtered=True, friction=False),
-    Situation("friction not fitted, x 3", filtered=True, friction=False, level=3.0),
+    Situation("exact motion, torque noise"),
+    Situation("exact motion, torque offsets", offsets=True),
+    Situation("exact motion, outliers", outliers=True, robust=True),
+    Situation("filtered at 20 Hz", 20.0),
+    Situation("filtered at 20 Hz, motion noise", 20.0, motion=1.0),
+    Situation("walked in MuJoCo, 20 Hz, motion noise", 20.0, motion=1.0, walked=True),
+    Situation("walked in MuJoCo, 10 Hz, motion noise", 10.0, motion=1.0, walked=True),
+    Situation("friction not in the model, 20 Hz", 20.0, friction=False),
 )
 
 
 def truth(robot: str, situation: Situation, seconds: float) -> tuple[TrueRobot, Exact]:
     """The true robot and what happened to it; point feet."""
     true = TrueRobot.unlike_its_urdf(replace(ROBOTS[robot], radius=0.0))
-    phi = true.phi.copy()
-    phi[:, FRICTION] *= situation.level
-    phi[:, FRICTION.start] *= situation.coulomb
-    true = replace(true, phi=phi)
     if situation.walked:
         return true, simulated(true, Reference(true, seconds, seed=1), seconds)
-    exact = _without_friction(robot, situation.steps, seconds)
+    exact = _without_friction(robot, seconds)
     velocity, torque = exact.log.joint_velocity, exact.log.joint_torque
     assert velocity is not None
     assert torque is not None
@@ -97,13 +85,12 @@ def truth(robot: str, situation: Situation, seconds: float) -> tuple[TrueRobot, 
 
 
 @cache
-def _without_friction(robot: str, steps: bool, seconds: float) -> Exact:
-    """A prescribed motion of a robot without friction, with or without steps."""
+def _without_friction(robot: str, seconds: float) -> Exact:
+    """A prescribed motion of a robot without friction."""
     true = TrueRobot.unlike_its_urdf(replace(ROBOTS[robot], radius=0.0))
     phi = true.phi.copy()
     phi[:, FRICTION] = 0.0
-    legged = true.legged if steps else replace(true.legged, lifted=())
-    true = replace(true, phi=phi, legged=legged)
+    true = replace(true, phi=phi)
     return prescribed(true, Reference(true, seconds, seed=1, static=True), seconds)
 
 
@@ -166,8 +153,11 @@ class Repetitions:
 
     def _samples(self, rng: np.random.Generator) -> Samples:
         situation, exact = self.situation, self.exact
-        log = self._recorded(rng) if situation.filtered else exact.log.select(slice(None, None, _SPARSE))
-        if not situation.filtered:
+        log = exact.log.select(slice(None, None, _SPARSE))
+        if situation.cutoff is not None:
+            recorded = record(exact, self.true.robot.base_link, self.noise, rng)
+            log = preprocess(recorded, situation.cutoff, _RATE)
+        else:
             assert log.joint_torque is not None
             deviation = self.noise.joint_torque * rng.normal(size=log.joint_torque.shape)
             if situation.outliers:
@@ -176,9 +166,6 @@ class Repetitions:
                 deviation += _OFFSET * np.random.default_rng(23).normal(size=deviation.shape[1])
             log = replace(log, joint_torque=log.joint_torque + deviation)
         return bind_log(log, self.true.robot, self.contacts)
-
-    def _recorded(self, rng: np.random.Generator) -> Log:
-        return preprocess(record(self.exact, self.true.robot.base_link, self.noise, rng), _CUTOFF, _RATE)
 
     def _fit(self, samples: Samples) -> Fit:
         logs = split_into_folds([samples], self.fitter.builder)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from legged import repetitions
+from interval_coverage import coverage_table
 from legged.errors import structural_base
 from legged.repetitions import (
     SITUATIONS,
@@ -16,6 +16,7 @@ from legged.repetitions import (
     summarize,
 )
 from legged.robots import GO2, QUADRUPED
+from legged_accuracy import accuracy_table
 from script_calls import call
 
 from torchid.identifiability.confounding import combination_standard_error
@@ -28,7 +29,7 @@ SECONDS = 3.0
 @pytest.fixture(scope="module")
 def exact() -> Repetitions:
     """Torques without noise."""
-    quiet = Repetitions("quadruped", SITUATION["torque noise"], SECONDS)
+    quiet = Repetitions("quadruped", SITUATION["exact motion, torque noise"], SECONDS)
     quiet.noise = replace(quiet.noise, joint_torque=0.0)
     return quiet
 
@@ -91,15 +92,15 @@ def test_errors_of_combinations_are_those_of_torchid(exact: Repetitions) -> None
             assert found[number] == pytest.approx(larger, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", ["filtered, switches, Coulomb", "unknown offsets", "friction not fitted, x 3"])
+@pytest.mark.parametrize(
+    "name", ["filtered at 20 Hz", "exact motion, torque offsets", "friction not in the model, 20 Hz"]
+)
 def test_situations_are_what_their_names_say(name: str) -> None:
     situation = SITUATION[name]
     one = Repetitions("quadruped", situation, SECONDS)
     samples = one._samples(np.random.default_rng(0))
-    assert (samples.oversampling > 1.0) == situation.filtered
+    assert (samples.oversampling > 1.0) == (situation.cutoff is not None)
     assert not samples.active.all()
-    usual = repetitions.truth("quadruped", SITUATION["torque noise"], SECONDS)[0]
-    np.testing.assert_allclose(one.true.friction, situation.level * usual.friction)
     tally = one.run(1)
     friction = structural_base(one.true.legged).kept % PER_BODY >= FRICTION.start
     assert np.isnan(tally.errors[0][friction]).all() == (not situation.friction)
@@ -107,9 +108,9 @@ def test_situations_are_what_their_names_say(name: str) -> None:
 
 
 def test_scripts_refuse_what_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    status, _, err = call("interval_coverage", "--situations", "torque nose")
+    status, _, err = call("interval_coverage", "--situations", "filtered at 20 hz")
     assert status == 2
-    assert "torque noise" in err
+    assert "filtered at 20 Hz" in err
     monkeypatch.setattr(type(GO2), "available", property(lambda self: self == QUADRUPED))
     for script in ("interval_coverage", "legged_accuracy"):
         status, _, err = call(script, "--robots", "Go2")
@@ -118,17 +119,17 @@ def test_scripts_refuse_what_is_not_there(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.study
-def test_coverage_of_white_torque_noise_is_right_and_that_of_switches_is_too_low() -> None:
-    situations = ("torque noise", "filtered, switches, Coulomb")
-    status, out, err = call("interval_coverage", "--quick", "--robots", "quadruped", "--situations", *situations)
-    assert status == 0, err
-    assert "coverage of 95 % intervals" in out
+@pytest.mark.slow("many fits")
+def test_intervals_hold_the_truth_with_torque_noise_and_behind_a_filter() -> None:
+    head, *rows = coverage_table(10, ["quadruped"], ["exact motion, torque noise", "filtered at 20 Hz"])
+    assert [float(row[1].split(" / ")[0]) > 90.0 for row in rows] == [True, True]
 
 
 @pytest.mark.study
+@pytest.mark.slow("simulations and whole fits")
 @pytest.mark.skipif(not GO2.available, reason="the package example-robot-data is not installed")
 def test_the_accuracy_of_go2_is_measured() -> None:
-    status, out, err = call("legged_accuracy", "--quick", "--robots", "Go2", "--sensors", "joints")
-    assert status == 0, err
-    assert "ball feet, as points" in out
-    assert "refused" not in out
+    _, points, balls, _, _ = accuracy_table(["Go2"], ["exact"], seeds=[0], seconds=8.0)
+    assert points[0] == "Go2, point feet"
+    assert float(points[1]) < 0.1
+    assert float(balls[1]) < 0.1
