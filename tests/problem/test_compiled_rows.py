@@ -187,6 +187,14 @@ def test_extra_parameters_of_joints_are_in_the_rows(sensors: str) -> None:
     assert (other.compiled is None) == bool(other.extras), "torch's"
 
 
+@pytest.mark.parametrize("turns", [1e4, 1e7])
+def test_joints_may_turn_many_times(turns: float) -> None:
+    plain, fast = builders(QUADRUPED, POINTS, sensor_set("full", QUADRUPED, POINTS))
+    samples = random_samples(QUADRUPED, POINTS, 100, 6, states=1)[0]
+    samples = replace(samples, joint_position=turns * samples.joint_position)
+    assert assert_same_rows(plain, fast, samples) == 1
+
+
 @pytest.mark.parametrize("of_base", [lambda x: x, by_axis], ids=["alike", "by axis"])
 def test_straight_knees_are_no_exception(
     of_base: Callable[[torchid.SensorSet], torchid.SensorSet], monkeypatch: pytest.MonkeyPatch

@@ -27,6 +27,12 @@ def why_not_compiled() -> str:
     return _load()[1]
 
 
+def lanes() -> int:
+    """Samples that a kernel handles at once: numbers of float64 in a register of the processor."""
+    library = compiled()
+    return 1 if library is None else library.torchid_lanes()
+
+
 def call(name: str, *arguments: Word | tuple[Word, ...] | float) -> None:
     """Call a kernel with contiguous arrays, integers, floats, and tuples of arrays and integers for structures."""
     getattr(compiled(), name)(*map(_converted, arguments))

@@ -4,10 +4,10 @@
 namespace {
 
 // Columns that are multiplied with each other at a time, so many that their products fill the registers.
-#ifdef __AVX512F__
+#if defined(__AVX512F__) || defined(__aarch64__)
 constexpr Int LEFT = 4, RIGHT = 4;
 #else
-constexpr Int LEFT = 3, RIGHT = 2;
+constexpr Int LEFT = 4, RIGHT = 3;
 #endif
 
 // To a register: GCC would load the same numbers again for each product.

@@ -5,7 +5,7 @@
 
 constexpr Int PANEL = 384; // rows: of two hundred columns they fill half of a second-level cache
 
-// Columns (n, step), each aligned to 64 bytes, of which the first `length` rows, a multiple of TILE, are used.
+// Columns (n, step), of which the first `length` rows, a multiple of TILE, are used.
 struct Panel {
     double *data;
     Int n, step, length;

@@ -1,14 +1,22 @@
-// Lanes: one number of each of 8 (float64) or 16 (float32) samples, which the processor handles at once.
-// A compiler divides a group among several registers where these are shorter than 64 bytes.
+// Lanes: one number of each of some samples, 2 to 8 of float64, as many as fill a register of the processor.
 #pragma once
+#include <cstdint>
 #include <cstring>
 
+#if defined(__AVX512F__)
+constexpr int REGISTER = 64; // bytes
+#elif defined(__AVX__)
+constexpr int REGISTER = 32;
+#else
+constexpr int REGISTER = 16;
+#endif
+
 template <class T> struct Group;
-template <> struct Group<double> { typedef double Type __attribute__((vector_size(64))); };
-template <> struct Group<float> { typedef float Type __attribute__((vector_size(64))); };
+template <> struct Group<double> { typedef double Type __attribute__((vector_size(REGISTER))); };
+template <> struct Group<float> { typedef float Type __attribute__((vector_size(REGISTER))); };
 
 template <class T> using V = typename Group<T>::Type;
-template <class T> constexpr long LANES = 64 / sizeof(T);
+template <class T> constexpr std::int64_t LANES = REGISTER / sizeof(T);
 
 // The numbers from `p` on, however it is aligned.
 template <class T> inline V<T> load(const T *p) {
@@ -18,19 +26,19 @@ template <class T> inline V<T> load(const T *p) {
 }
 
 // The first `n` numbers from `p` on, and zeros.
-template <class T> inline V<T> load(const T *p, long n) {
+template <class T> inline V<T> load(const T *p, std::int64_t n) {
     if (n >= LANES<T>) return load(p);
     V<T> v = {};
-    for (long k = 0; k < n; ++k) v[k] = p[k];
+    for (std::int64_t k = 0; k < n; ++k) v[k] = p[k];
     return v;
 }
 
 template <class T> inline void store(T *p, const V<T> &v) { std::memcpy(p, &v, sizeof v); }
 
 // Only the first `n` lanes.
-template <class T> inline void store(T *p, const V<T> &v, long n) {
+template <class T> inline void store(T *p, const V<T> &v, std::int64_t n) {
     if (n >= LANES<T>) return store(p, v);
-    for (long k = 0; k < n; ++k) p[k] = v[k];
+    for (std::int64_t k = 0; k < n; ++k) p[k] = v[k];
 }
 
 // One number in all lanes; NaN stays NaN.
@@ -40,7 +48,7 @@ template <class T> inline V<T> fill(T x) { return V<T>{} + x; }
 template <class T> inline T sum(const V<T> &v) {
     T x[LANES<T>];
     std::memcpy(x, &v, sizeof v);
-    for (long half = LANES<T> / 2; half > 0; half /= 2)
-        for (long k = 0; k < half; ++k) x[k] += x[k + half];
+    for (std::int64_t half = LANES<T> / 2; half > 0; half /= 2)
+        for (std::int64_t k = 0; k < half; ++k) x[k] += x[k + half];
     return x[0];
 }

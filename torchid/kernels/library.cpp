@@ -1,9 +1,13 @@
 // What the loader asks of the library before it calls a kernel.
+#include "lanes.h"
 
 extern "C" {
 
 // Checksum of the sources that this library is compiled from.
 unsigned torchid_checksum() { return TORCHID_CHECKSUM; }
+
+// Samples that a kernel handles at once.
+int torchid_lanes() { return LANES<double>; }
 
 // Whether this processor has the instructions that the library is compiled for.
 int torchid_supported() {

@@ -101,17 +101,17 @@ void scale_rows(Lanes *W, Int first, Int end, const double *row_std, bool divide
 
 // Write W of each sample, as `limb_null_space` gives it where contact forces are unmeasured.
 //
-// axes: (9, padded), by rows the matrix whose columns are the axes of the base rows' noise, in base axes.
+// axes: (T, 9, TILE), by rows the matrix whose columns are the axes of the base rows' noise, in base axes.
 // worst: squared condition number of a limb from which on a sample is suspect.
 // least_pivot: fraction of a column's square that must remain.
 // W: tiles (m, 6, TILE), written.
-// suspect: (padded,), written: W of such samples is worthless.
+// suspect: (T TILE,), written: W of such samples is worthless.
 extern "C" void write_bases(const Motion *motion, const Limbs *limbs, const double *axes, double worst, double least_pivot,
                             double *W, bool *suspect) {
     const Int m = limbs->dofs;
     std::vector<State> states(motion->nodes);
     std::vector<Lanes> rows(BASE * 2 * BASE), basis(m * BASE);
-    for (Int tile = 0; tile < motion->padded / TILE; ++tile) {
+    for (Int tile = 0; tile < motion->tiles; ++tile) {
         write_states(*motion, tile, states.data());
         basis.assign(m * BASE, Lanes{});
         Lanes condition = {};
@@ -122,7 +122,7 @@ extern "C" void write_bases(const Motion *motion, const Limbs *limbs, const doub
         }
         scale_rows(basis.data(), BASE, m, limbs->row_std, false);
         Lanes noise[3][3]; // by rows
-        for (Int k = 0; k < 9; ++k) noise[k / 3][k % 3] = load(axes + k * motion->padded + tile * TILE);
+        for (Int k = 0; k < 9; ++k) noise[k / 3][k % 3] = load(axes + (tile * 9 + k) * TILE);
         for (Int row = 0; row < BASE; ++row)
             for (Int k = 0; k < 3; ++k) basis[row * BASE + row - row % 3 + k] = limbs->row_std[row] * noise[k][row % 3];
         auto doubtful = orthonormalize(basis.data(), m, least_pivot) | ~(condition < worst);

@@ -4,8 +4,8 @@
 
 namespace {
 
-// `SPAN` in torchid.problem.compiled_rows: samples whose rows are multiplied at once; 512 kB to 2 MB.
-constexpr Int SPAN = 16 * TILE;
+// As in torchid.problem.compiled_rows: samples whose rows are multiplied at once, and numbers between their columns.
+constexpr Int SPAN = 128, PADDING = 8;
 constexpr Int INERTIA = 4; // the first inertial parameter that demands no force
 
 // A block of rows: its first row in W and their number, columns with the right-hand side, where it starts in memory,
@@ -27,7 +27,7 @@ struct Body {
 struct Rows {
     Int samples, rank, step; // B; rows of all blocks at a sample; numbers between tiles of W, 0 if one serves for all
     const double *W;         // tiles (degrees of freedom, rank, TILE)
-    const double *forces;    // (degrees of freedom, padded), measured [N, N m]
+    const double *forces;    // (degrees of freedom, B), measured [N, N m]
     Int block_count, move_count, body_count, path_sums;
     const Block *blocks;
     const Move *moves;
@@ -44,7 +44,7 @@ struct Target {
     bool packed; // without space above the rows, columns aligned
 
     Int step(const Block &block) const {
-        return packed ? block.count * SPAN + TILE : block.width + block.count * room;
+        return packed ? block.count * SPAN + PADDING : block.width + block.count * room;
     }
     double *at(const Block &block, Int column, Int row) const {
         return data + block.start + column * step(block) + (packed ? 0 : block.width) + row * room;
@@ -93,7 +93,7 @@ class Writer {
             if (block.path_sum) sums[block.path_sum * most + row] = {{W(0, k), W(1, k), W(2, k)}, {W(3, k), W(4, k), W(5, k)}};
             Lanes total = {};
             for (Int dof = block.dof; dof < block.end; ++dof)
-                total += W(dof, k) * stream(rows.forces + dof * motion.padded + tile * TILE);
+                total += W(dof, k) * load(rows.forces + dof * rows.samples + tile * TILE, size);
             put<whole>(target.at(block, block.width - 1, row) + to, total);
         }
     }
@@ -172,7 +172,7 @@ extern "C" void write_rows(const Motion *motion, const Rows *rows, double *out) 
 //
 // k: (blocks,), columns of each block that are replaced.
 // lower, combination: of the blocks, one after the other, see `Levels`.
-// scratch: rows of a span, (width, count SPAN + TILE) of each block, aligned to 64 bytes.
+// scratch: rows of a span, (width, count SPAN + PADDING) of each block.
 // squares, grams: likewise, written.
 extern "C" void write_grams(const Motion *motion, const Rows *rows, const Int *k, const Int *lower,
                             const double *combination, double *scratch, double *squares, double *grams) {

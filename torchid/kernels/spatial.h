@@ -1,4 +1,4 @@
-// Vectors in space and the motion of all joint frames, of 8 samples at once.
+// Vectors in space and the motion of all joint frames, of as many samples as there are lanes.
 #pragma once
 #include "lanes.h"
 #include <cmath>
@@ -7,8 +7,7 @@
 
 using Int = std::int64_t;
 using Lanes = V<double>;
-constexpr Int TILE = LANES<double>; // samples of a tile, `TILE` in torchid.problem.compiled_rows
-constexpr Int AHEAD = 3;            // tiles
+constexpr Int TILE = LANES<double>; // samples of a tile
 
 // Copied number by number: GCC copies a plain structure through memory.
 struct Vector {
@@ -52,29 +51,26 @@ inline Lanes square_root(Lanes x) {
     return x;
 }
 
-// Read one of many rows: processors do not notice that the next tiles follow.
-inline Lanes stream(const double *p) {
-    __builtin_prefetch(p + AHEAD * TILE);
-    return load(p);
-}
+// Cosine and sine of a joint's angle, the position of a prismatic joint [m], velocity, acceleration, friction's sign.
+enum JointRow { COSINE, SINE, SLIDE, VELOCITY, ACCELERATION, DIRECTION, JOINT_ROWS };
 
 // Motion of a chunk, as `torchid.problem.compiled_rows` passes it: nodes come after their parents, node 0 is the base.
 struct Motion {
-    Int nodes, padded;     // L, and the number of samples rounded up to tiles
-    const Int *parent;     // (L,)
-    const double *pose;    // (L, 3, 4) in the parent's frame at position 0 [m]
-    const double *slides;  // (L,), 1 where the joint is prismatic, else 0
-    const double *joints;  // (6, L, padded), see `JointRow`
-    const double *base;    // (9, padded): angular velocity [rad/s] and acceleration [rad/s^2], specific force [m/s^2]
+    Int nodes, tiles;     // L, T
+    const Int *parent;    // (L,)
+    const double *pose;   // (L, 3, 4) in the parent's frame at position 0 [m]
+    const double *slides; // (L,), 1 where the joint is prismatic, else 0
+    const double *joints; // (T, L, JOINT_ROWS, TILE), see `JointRow`
+    const double *base;   // (T, 9, TILE): angular velocity [rad/s] and acceleration [rad/s^2], specific force [m/s^2]
 
-    Lanes joint(Int row, Int node, Int tile) const { return stream(joints + (row * nodes + node) * padded + tile * TILE); }
+    Lanes joint(Int row, Int node, Int tile) const {
+        return load(joints + ((tile * nodes + node) * JOINT_ROWS + row) * TILE);
+    }
     Vector of_base(Int row, Int tile) const {
-        const double *at = base + row * padded + tile * TILE;
-        return {stream(at), stream(at + padded), stream(at + 2 * padded)};
+        const double *at = base + (tile * 9 + row) * TILE;
+        return {load(at), load(at + TILE), load(at + 2 * TILE)};
     }
 };
-// Cosine and sine of a joint's angle, the position of a prismatic joint [m], velocity, acceleration, friction's sign.
-enum JointRow { COSINE, SINE, SLIDE, VELOCITY, ACCELERATION, DIRECTION };
 
 // State of a joint frame in base axes, as `torchid.regressor.kinematics.body_states` gives it.
 struct State {

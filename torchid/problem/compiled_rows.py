@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.kernels import Word, call
+from torchid.kernels import Word, call, lanes
 from torchid.parameters import Array
 from torchid.problem.contact_state import ContactStateLayout, RowBlock
 from torchid.problem.extras import dof_extra_column
@@ -18,12 +18,13 @@ from torchid.problem.null_bases import general_bases
 from torchid.problem.row_compressor import ColumnLevels
 from torchid.problem.rows import BlockRows, RowBuilder, Workspace, subtract_payload
 from torchid.problem.samples import Samples
-from torchid.regressor.kinematics import Motion, joint_motion
+from torchid.regressor.kinematics import Motion, require_precision
 from torchid.regressor.tree import KinematicTree
 from torchid.sensing.limbs import PIVOT, WELL_CONDITIONED
 
-TILE = 8  # samples that kernels handle at once, see `kernels/spatial.h`
-SPAN = 128  # samples whose rows they multiply at once, see `kernels/rows.cpp`
+TILE = lanes()
+SPAN = 128  # samples whose rows are multiplied at once, see `kernels/rows.cpp`
+_PADDING = 8  # numbers between columns of these rows
 _BASE = 6  # columns of W where a robot stands on limbs
 
 
@@ -31,7 +32,7 @@ class _Motion(NamedTuple):
     """`Motion` of `kernels/spatial.h`."""
 
     nodes: int
-    padded: int
+    tiles: int
     parent: np.ndarray
     pose: Array
     slides: Array
@@ -137,8 +138,8 @@ class _Group:
 
     def arguments(self, placed: np.ndarray, workspace: Workspace) -> tuple[tuple[Word, ...], tuple[Word, ...]]:
         """`Motion` and `Rows` of the kernels."""
-        forces = workspace.empty("forces", self.W, self.f.shape[1], self.motion.padded)
-        forces[:, : len(self.f)] = self.f.T
+        forces = workspace.empty("forces", self.W, *self.f.T.shape)
+        forces.copy_(self.f.T)
         tables = self.tables
         step = self.W[0].numel() if len(self.W) > 1 else 0
         lengths = (len(placed), len(tables.moves), len(tables.bodies), tables.path_sums)
@@ -198,7 +199,7 @@ class CompiledChunk:
 
     def _multiplied(self, group: _Group, levels: Sequence[ColumnLevels]) -> Iterator[tuple[RowBlock, Array, Array]]:
         counts, widths = group.tables.blocks[:, 1:3].T
-        sizes = widths * (counts * SPAN + TILE)
+        sizes = widths * (counts * SPAN + _PADDING)
         scratch = self.workspace.empty("rows", group.W, int(sizes.sum()))
         lower, combination = (
             np.concatenate([getattr(x, name).ravel() for x in levels]) for name in ("lower", "to_lower")
@@ -224,7 +225,7 @@ class CompiledChunk:
             extra = builder.extras[column - builder.columns.count]
             out.zero_()
             for joint in [joint for joint in extra.dofs if joint in in_W]:
-                weight = group.W[:, in_W[joint], block.rows].expand(group.motion.padded // TILE, -1, -1)
+                weight = group.W[:, in_W[joint], block.rows].expand(group.motion.tiles, -1, -1)
                 weight = weight.transpose(0, 1).flatten(1)[:, : len(samples)]
                 out.addcmul_(weight, dof_extra_column(extra, joint, samples, builder.tree))
 
@@ -239,6 +240,11 @@ class CompiledRows:
         self._parent = np.maximum(tree.parents, 0)
         self._pose = np.ascontiguousarray(tree.T_parent_joint[:, :3]).reshape(-1)
         self._slides = np.array(tree.slides, dtype=float)
+        moving = tree.joint_map[:, : tree.n].numpy()
+        nodes, joints = map(np.ascontiguousarray, np.nonzero(moving))
+        first = np.searchsorted(nodes, np.arange(tree.n_nodes + 1))
+        kinds = (x.contiguous() for x in (tree.joint_constant, tree.revolute, tree.prismatic))
+        self._mechanism: tuple[Word, ...] = (tree.n_nodes, tree.n, first, joints, moving[nodes, joints], *kinds)
         self._limbs: dict[int, tuple[Word, ...]] = {}
         self._tables_by_blocks: dict[int, _BlockTables] = {}
 
@@ -271,24 +277,18 @@ class CompiledRows:
         return tables
 
     def _motion(self, motion: Motion, workspace: Workspace) -> _Motion:
+        """Motion of all joints by a kernel, as `joint_motion` gives it."""
         tree = self._builder.tree
-        joints = joint_motion(tree, motion)
-        nodes, samples = joints.position.shape
-        padded = (-(-samples // TILE) | 1) * TILE  # rows an odd number of tiles apart share few lines of a cache
-        out = workspace.empty("joints", joints.position, 6, nodes, padded)
-        base = workspace.empty("base", joints.position, 9, padded)
-        out[..., samples:] = 0.0
-        base[:, samples:] = 0.0
-        cosine, sine, slide, *others = out[..., :samples]
-        angle = joints.position * tree.revolute
-        torch.cos(angle, out=cosine)
-        torch.sin(angle, out=sine)
-        torch.mul(joints.position, tree.prismatic, out=slide)
-        for row, values in zip(others, (joints.velocity, joints.acceleration, joints.direction), strict=True):
-            row.copy_(values)
-        of_base = (motion.base_angular_velocity, motion.base_angular_acceleration, motion.base_specific_force)
-        torch.cat([x.T for x in of_base], out=base[:, :samples])
-        return _Motion(nodes, padded, self._parent, self._pose, self._slides, out, base)
+        require_precision(tree, vars(motion))
+        joint_rows = (motion.joint_position, motion.joint_velocity, motion.joint_acceleration, motion.joint_direction)
+        base_rows = (motion.base_angular_velocity, motion.base_angular_acceleration, motion.base_specific_force)
+        samples = len(motion.joint_position)
+        log: list[Word] = [samples, *(0 if x is None else x.contiguous() for x in (*joint_rows, *base_rows))]
+        tiles = -(-samples // TILE)
+        joints = workspace.empty("joints", motion.joint_position, tiles, tree.n_nodes, 6, TILE)
+        base = workspace.empty("base", joints, tiles, 9, TILE)
+        call("write_motion", self._mechanism, tuple(log), tree.sign_width or 0.0, joints, base)
+        return _Motion(tree.n_nodes, tiles, self._parent, self._pose, self._slides, joints, base)
 
     def _bases(
         self, samples: Samples, layout: ContactStateLayout, motion: _Motion, workspace: Workspace
@@ -303,10 +303,10 @@ class CompiledRows:
         if len(bases) != 1 or bases[0][1].shape[2] != len(samples):
             return None
         basis = bases[0][1]
-        by_row = workspace.empty("W by row", basis, *basis.shape[:2], motion.padded)
+        by_row = workspace.empty("W by row", basis, *basis.shape[:2], motion.tiles * TILE)
         by_row[..., : len(samples)] = basis
         by_row[..., len(samples) :] = 0.0
-        W = workspace.empty("W", basis, motion.padded // TILE, *basis.shape[:2], TILE)
+        W = workspace.empty("W", basis, motion.tiles, *basis.shape[:2], TILE)
         W.copy_(by_row.unflatten(2, (-1, TILE)).permute(2, 0, 1, 3))
         return W, builder.coupled_forces_with_contacts(layout, contact, chunk)
 
@@ -318,12 +318,14 @@ class CompiledRows:
         key = id(layout)  # which the builder keeps
         if key not in self._limbs:
             self._limbs[key] = _limbs(builder.tree, layout)
-        W = workspace.empty("W", motion.base, motion.padded // TILE, len(layout.row_std), _BASE, TILE)
-        suspect = torch.empty(motion.padded, dtype=torch.bool)
+        W = workspace.empty("W", motion.base, motion.tiles, len(layout.row_std), _BASE, TILE)
+        suspect = torch.empty(motion.tiles * TILE, dtype=torch.bool)
         axes = builder.noise_axes(samples.base.rotation, builder.sensors.noise)
-        along = workspace.empty("axes", motion.base, 3, 3, motion.padded)
-        along[..., : len(samples)] = torch.eye(3)[..., None] if axes is None else axes.permute(1, 2, 0)
-        along[..., len(samples) :] = 0.0
+        along = workspace.empty("axes", motion.base, motion.tiles * TILE, 3, 3)
+        along[:] = torch.eye(3)
+        if axes is not None:
+            along[: len(samples)] = axes
+        along = along.view(-1, TILE, 9).mT.contiguous()
         call("write_bases", motion, self._limbs[key], along, WELL_CONDITIONED**2, PIVOT, W, suspect)
         doubtful = torch.nonzero(suspect[: len(samples)])[:, 0]
         if len(doubtful):
