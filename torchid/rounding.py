@@ -32,9 +32,10 @@ STD_PER_MAD = 1.4826
 
 
 def column_scale(A: Array) -> Array:
-    """Factors that scale the columns of A, (R, n), to norm 1, (n,); 0 for columns of zeros."""
+    """Factors that scale the columns of A, (R, n), to norm 1, (n,); 0 for columns of zeros or of rounding errors."""
     norms = np.linalg.norm(A, axis=0)
-    return np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0.0)
+    rounding = float(np.finfo(float).eps) * norms.max(initial=0.0)
+    return np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > rounding)
 
 
 def relative_tolerance(tolerance: float, shape: tuple[int, ...], eps: float = float(np.finfo(float).eps)) -> float:

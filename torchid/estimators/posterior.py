@@ -162,7 +162,8 @@ def _widen(covariance: Array, weights: Array, least: float) -> None:
     along = covariance @ weights
     variance = float(weights @ along)
     if least > variance > 0.0:
-        covariance += (least - variance) / variance**2 * np.outer(along, along)
+        unit = along / np.sqrt(variance)
+        covariance += (least / variance - 1.0) * np.outer(unit, unit)
 
 
 _WIDTHS = np.geomspace(0.01, 10.0, 300)  # relative errors of nominal bodies to consider, in steps of 2.3 %
