@@ -23,7 +23,7 @@ setup(
             define_macros=[("TORCHID_CHECKSUM", f"{checksum}u")],
             extra_compile_args=[
                 *("-std=c++17", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
-                *("-pthread", "-Wno-psabi", "-Wall", "-Wextra"),
+                *("-pthread", "-g0", "-Wno-psabi", "-Wall", "-Wextra"),
                 f"-march={march}" if march else "-mcpu=native" if arm else "-march=native",
             ],
             extra_link_args=["-pthread"],

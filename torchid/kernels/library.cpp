@@ -11,23 +11,19 @@ int torchid_lanes() { return LANES<double>; }
 
 // Whether this processor has the instructions that the library is compiled for.
 int torchid_supported() {
-    int supported = 1;
-#if defined(__x86_64__) || defined(__i386__)
-    __builtin_cpu_init();
-#ifdef __AVX2__
-    supported = supported && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("bmi2");
-#endif
-#ifdef __FMA__
-    supported = supported && __builtin_cpu_supports("fma");
-#endif
 #ifdef __AVX512F__
-    supported = supported && __builtin_cpu_supports("avx512f");
+    if (!__builtin_cpu_supports("avx512f")) return 0;
 #endif
 #ifdef __AVX512VL__
-    supported = supported && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq") &&
-                __builtin_cpu_supports("avx512bw");
+    if (!__builtin_cpu_supports("avx512vl") || !__builtin_cpu_supports("avx512dq")) return 0;
+    if (!__builtin_cpu_supports("avx512bw")) return 0;
 #endif
+#ifdef __AVX2__
+    if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("bmi2")) return 0;
 #endif
-    return supported;
+#ifdef __FMA__
+    if (!__builtin_cpu_supports("fma")) return 0;
+#endif
+    return 1;
 }
 }
