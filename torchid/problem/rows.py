@@ -8,9 +8,9 @@ their unmeasured forces under which the noise is white (`null_bases.whitened_bas
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
@@ -36,7 +36,6 @@ from torchid.problem.extras import (
 )
 from torchid.problem.motion import levelled_base_axes
 from torchid.problem.null_bases import ContactRows, spread_columns, whitened_bases
-from torchid.problem.row_compressor import ColumnLevels
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import all_wrench_columns
 from torchid.regressor.kinematics import BodyStates, JointMotion, body_states, joint_motion, joint_screw_axes
@@ -51,6 +50,9 @@ from torchid.regressor.regressor import (
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
+
+if TYPE_CHECKING:
+    from torchid.problem.compiled_rows import CompiledRows
 
 EVERY = slice(None)
 
@@ -170,25 +172,6 @@ class BlockRows:
     absent: Tensor | None = None
 
 
-class KernelRows(Protocol):
-    """Rows of a chunk that compiled kernels make, see `torchid.problem.compiled_rows.CompiledChunk`."""
-
-    def rows(self, without: Collection[int] = ()) -> Iterator[tuple[BlockRows, slice]]:
-        """As `RowBuilder.blocks`; `without`: identities of blocks that are left out."""
-
-    def grams(
-        self, levels: Callable[[tuple[int, ...]], ColumnLevels | None]
-    ) -> Iterator[tuple[RowBlock, Array, Array]]:
-        """Blocks with squares and Gram matrices as `write_gram` of `torchid.problem.row_compressor` writes them."""
-
-
-class Kernels(Protocol):
-    """Compiled kernels of a builder, see `torchid.problem.compiled_rows.CompiledRows`."""
-
-    def chunk(self, samples: Samples, layout: ContactStateLayout, workspace: Workspace) -> KernelRows | None:
-        """The rows of a chunk; None where kernels cannot make them."""
-
-
 class RowBuilder(nn.Module):
     """Fast implementation of the fit's equations: rows of `W^T [K_columns | f]`.
 
@@ -249,7 +232,7 @@ class RowBuilder(nn.Module):
         self.register_buffer("normals", torch.from_numpy(normals), persistent=False)
         self.register_buffer("task_weights", None if weights is None else torch.from_numpy(weights), persistent=False)
         self.workspaces = Workspaces()
-        self.compiled: Kernels | None = None
+        self.compiled: CompiledRows | None = None
 
     def __repr__(self) -> str:
         return f"RowBuilder: {len(self.contacts)} contacts, {self.width} columns, {self.sensors!r}"
