@@ -2,15 +2,11 @@
 
     python scripts/benchmark.py [--samples 262144] [--repeats 5] [--device cuda]
 
-Needs the packages pin and example-robot-data (extra `[oracle]`). Pipelines
-start from the arrays of a log and end with parameters. Sensors are `joints` (torques measured, contact forces not); all
-feet are in contact in two thirds of the samples. Consistent parameters are timed on noisy data of Solo12 that were
-generated with other, physically consistent parameters.
-
-The modules for training loops are timed on one thread beside Pinocchio and NumPy called sample by sample, see
-`scripts/modules.py`. With `--device cuda` torchid's part of the fits runs on a GPU, the per-sample pipelines on the CPU
-as ever. A second table has the
-stages of the compression beside their floors, see `scripts/stages.py`.
+Needs the packages pin and example-robot-data (extra `[oracle]`). Pipelines start from the arrays of a log and end with
+parameters. Sensors are `joints` (torques measured, contact forces not); all feet are in contact in two thirds of the
+samples. With `--device cuda` torchid's part runs on a GPU, the per-sample pipelines on the CPU as ever. A second table
+has the modules for training loops (`scripts/modules.py`), a third the stages of the compression beside their floors
+(`scripts/stages.py`).
 """
 
 from __future__ import annotations
@@ -20,32 +16,29 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import torch
-from modules import ModuleCase, module_rows
+from markdown_table import Rows, print_table
+from modules import ROWS, ModuleCase, Work, on_threads
 from rich.console import Console
-from rich.table import Table
-from stages import Limits, Stages, measure_stages, stage_table, synchronize
+from stages import Limits, measure_stages, stage_table, synchronize
 from threadpoolctl import ThreadpoolController
 
 from torchid.errors import TorchidWarning, how_to_install
 from torchid.estimators import Consistent, LeastSquares
-from torchid.parameters import FRICTION, Array, perturb_parameters
+from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.motion import BaseMotion
-from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 _CPU = torch.device("cpu")
 _PAUSE = 0.1  # seconds before each time that is taken: OpenBLAS' threads spin for some 30 ms after their last product
 _STAGED = 65536  # samples whose stages are timed
-_DENSE = 16384  # samples whose whole regressor a GPU has at a time: 1.7 GB of G1
 _FEW = 2048  # samples that the per-sample pipelines are timed with
 
 
@@ -187,39 +180,6 @@ class PerSample:
             pin.computeJointTorqueRegressor(self.model, self.data, *x)
 
 
-def torques_of(robot: Robot, case: Case, samples: Samples, phi: Array, noise: float) -> Samples:
-    """The same motion with noisy torques [N m] of a robot with parameters (12 L,) and unmeasured foot forces."""
-    regressor, feet = Regressor(robot), [FrameJacobian(robot, foot) for foot in case.feet]
-    rows = 3 if case.kind == "point" else 6
-    rng, torques = torch.Generator().manual_seed(1), []
-    for start in range(0, len(samples), 1024):
-        part = samples[start : start + 1024]
-        q, v, a = part.coordinates()
-        generalized = regressor(q, v, a) @ torch.from_numpy(phi)
-        J = torch.cat([foot(q)[:, :rows] for foot in feet], dim=1)
-        J = J * part.active.repeat_interleave(rows, dim=1)[..., None]
-        contact = (torch.linalg.pinv(J[:, :, :6].mT) @ generalized[:, :6, None]).mT @ J
-        torques.append(generalized[:, 6:] - contact[:, 0, 6:])
-    exact = torch.cat(torques)
-    noisy = exact + noise * torch.randn(exact.shape, generator=rng, dtype=exact.dtype)
-    return replace(samples, torque=noisy)
-
-
-def measure_consistent(count: int, repeats: int, device: torch.device) -> dict[str, float]:
-    """Median seconds from the arrays of a log of Solo12 to parameters."""
-    case, noise = CASES[0], 0.1
-    bench = Bench.of(case, count, device, SensorNoise(noise))
-    phi = perturb_parameters(bench.robot.nominal, 0.2, np.random.default_rng(0))
-    phi[1:, FRICTION] = 0.1
-    bench = replace(bench, samples=torques_of(bench.robot, case, bench.samples, phi.flatten(), noise))
-    estimators: dict[str, LeastSquares | Consistent] = {
-        "least squares": LeastSquares(1e-4),
-        "consistent": Consistent(1e-4),
-    }
-    pipelines = {name: (partial(bench.fit, estimator), 10**6) for name, estimator in estimators.items()}
-    return medians(pipelines, repeats, device)
-
-
 def medians(
     pipelines: Mapping[str, tuple[Callable[[], object], int]], repeats: int, device: torch.device = _CPU
 ) -> dict[str, float]:
@@ -246,76 +206,62 @@ def microseconds(work: Callable[[], object], samples: int, device: torch.device)
     return (time.perf_counter() - start) / samples * 1e6
 
 
-def blas_kernels() -> str:
-    """Library of linear algebra, and the processor whose kernels it has chosen."""
-    libraries = ThreadpoolController().select(user_api="blas").info()
-    names = {f"{x['internal_api']} {x['version']}, {x.get('architecture', 'unknown')} kernels" for x in libraries}
-    return "; ".join(sorted(names)) or "unknown"
-
-
-def measure(
-    case: Case, count: int, repeats: int, device: torch.device, limits: Limits
-) -> tuple[dict[str, float], Stages]:
-    """Medians of microseconds per sample of one robot, and its stages."""
+def measure(case: Case, count: int, repeats: int, device: torch.device) -> dict[str, float]:
+    """Medians of microseconds per sample of one robot."""
     bench = Bench.of(case, count, device)
-    robot, builder, samples = bench.robot, bench.builder, bench.samples
-    per_sample = PerSample(robots_folder() / case.urdf, robot, case)
-    regressor = Regressor(robot).to(device)
-    step = 1024 if device.type == "cpu" else _DENSE
-    some = samples[: min(count, _STAGED)].to(device)
-    few = samples[torch.arange(0, count, max(1, count // _FEW))]
-
-    def in_chunks(work: Callable[[Samples], object]) -> Callable[[], None]:
-        def run() -> None:
-            with torch.inference_mode():
-                for start in range(0, len(some), step):
-                    work(some[start : start + step])
-
-        return run
+    per_sample = PerSample(robots_folder() / case.urdf, bench.robot, case)
+    few = bench.samples[torch.arange(0, count, max(1, count // _FEW))]
 
     pipelines: dict[str, tuple[Callable[[], object], int]] = {
-        "K, Pinocchio": (lambda: per_sample.regressors(few), len(few)),
-        "K, torchid, 12 L columns": (in_chunks(lambda part: regressor.from_motion(part.motion())), len(some)),
-        "wrench columns, torchid": (in_chunks(builder.dynamics), len(some)),
-        "per sample, lstsq": (lambda: per_sample.by_stack(few), len(few)),
-        "per sample, Gram": (lambda: per_sample.by_gram(few), len(few)),
+        "regressor alone, Pinocchio": (lambda: per_sample.regressors(few), len(few)),
+        "`lstsq`, Pinocchio and NumPy sample by sample": (lambda: per_sample.by_stack(few), len(few)),
+        "Gram matrix, Pinocchio and NumPy sample by sample": (lambda: per_sample.by_gram(few), len(few)),
+        "torchid, one thread": (on_threads(1, bench.fit), count),
         "torchid": (bench.fit, count),
     }
-    measured, by_stages = medians(pipelines, repeats, device), samples[torch.arange(0, count, max(1, count // _STAGED))]
-    return measured, measure_stages(builder, by_stages, limits)
+    return medians(pipelines, repeats, device)
 
 
-def module_table(repeats: int) -> Table:
-    """Times of the modules of two robots and their shares of the peers'; calls of small batches are repeated."""
-    names = [case for case in CASES if case.name != "Alexander legs"]
-    works = dict[str, tuple[Callable[[], object], int]]()
-    for case in names:
+def speed_table(count: int = 262_144, repeats: int = 5, device: torch.device = _CPU) -> Rows:
+    """Microseconds per sample of whole fits."""
+    measured = [measure(case, count, repeats, device) for case in CASES]
+    yield "", *(case.name for case in CASES)
+    for name in measured[0]:
+        yield name, *(f"{times[name]:.1f}" for times in measured)
+
+
+def modules_table(repeats: int = 15) -> Rows:
+    """Times of the modules on one thread, as shares of those of Pinocchio and NumPy in a Python loop."""
+    cases = [case for case in CASES if case.name != "Alexander legs"]
+    works = dict[str, Work]()
+    for case in cases:
         urdf = robots_folder() / case.urdf
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TorchidWarning)
-            timed = ModuleCase(load_robot(urdf), str(urdf), case.feet, 3 if case.kind == "point" else 6)
-        for name, (work, samples) in timed.works().items():
-            calls = max(1, 256 // samples)
-            works[f"{case.name} {name}"] = partial(repeat, work, calls), samples * calls
-    measured = medians(works, repeats)
-    table = Table(title="Modules on one thread: microseconds per sample, and share of Pinocchio's or NumPy's time")
-    for column in ("", *(case.name for case in names), "bar"):
-        table.add_column(column, justify="right" if column else "left")
-    rows = [module_rows({name: measured[f"{case.name} {name}"] for name in timed.works()}) for case in names]
-    for of_robots in zip(*rows, strict=True):
-        (title, _, _, bar) = of_robots[0]
-        table.add_row(title, *(f"{time:.3g}; {share:.2f}" for _, time, share, _ in of_robots), f"{bar}")
-    return table
+            robot = load_robot(urdf)
+        timed = ModuleCase(robot, str(urdf), case.feet, 3 if case.kind == "point" else 6)
+        works |= {f"{case.name} {name}": repeated(*work) for name, work in timed.works().items()}
+    with ThreadpoolController().limit(limits=1):
+        measured = medians(works, repeats)
+    yield "share of the time of Pinocchio or NumPy", *(case.name for case in cases), "at most"
+    for title, peer, name, most in ROWS:
+        shares = (measured[f"{case.name} {name}"] / measured[f"{case.name} {peer}"] for case in cases)
+        yield title, *(f"{share:.2f}" for share in shares), f"{most:g}"
 
 
-def repeat(work: Callable[[], object], calls: int) -> None:
-    """Call something often."""
-    for _ in range(calls):
-        work()
+def repeated(work: Callable[[], object], samples: int) -> Work:
+    """Calls for 8192 samples at least: after a pause, the first finds no data in the caches."""
+    calls = max(1, 8192 // samples)
+
+    def run() -> None:
+        for _ in range(calls):
+            work()
+
+    return on_threads(1, run), samples * calls
 
 
 def main() -> None:
-    """Measure all robots and print one table."""
+    """Measure and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--samples", type=int, default=262_144)
     parser.add_argument("--repeats", type=int, default=5)
@@ -324,32 +270,13 @@ def main() -> None:
     device = arguments.device
     if device.type == "cuda" and not torch.cuda.is_available():
         raise SystemExit("benchmark: --device: found no GPU that torch can use; accepted: cpu, or a machine with one")
-    table = Table(title=f"Median microseconds per sample, {torch.get_num_threads()} threads, float64, {device}")
-    limits, results, stages = Limits.of(device), dict[str, dict[str, float]](), dict[str, Stages]()
-    for case in CASES:
-        results[case.name], stages[case.name] = measure(case, arguments.samples, arguments.repeats, device, limits)
-    measured = measure_consistent(10_500, arguments.repeats, device)
-    table.add_column("")
-    for case in CASES:
-        table.add_column(case.name, justify="right")
-    for name in next(iter(results.values())):
-        table.add_row(name, *(f"{results[case.name][name]:.1f}" for case in CASES))
-    for name in ("per sample, lstsq", "per sample, Gram"):
-        ratios = [results[case.name][name] / results[case.name]["torchid"] for case in CASES]
-        table.add_row(f"{name} / torchid", *(f"{ratio:.1f}" for ratio in ratios))
-    consistent = Table(title="Seconds from the arrays of 10,500 samples of Solo12 to parameters, friction included")
-    for name in measured:
-        consistent.add_column(name, justify="right")
-    consistent.add_row(*(f"{seconds:.2f}" for seconds in measured.values()))
-    console = Console(width=100)
-    console.print(table)
-    console.print(f"products of matrices: {blas_kernels()}")
-    console.print(stage_table(stages, limits, device))
-    console.print(consistent)
+    print_table(speed_table(arguments.samples, arguments.repeats, device))
     if device.type == "cpu":
-        torch.set_num_threads(1)
-        with ThreadpoolController().limit(limits=1):
-            console.print(module_table(arguments.repeats))
+        print_table(modules_table(3 * arguments.repeats))
+    limits = Limits.of(device)
+    benches = {case.name: Bench.of(case, _STAGED, device) for case in CASES}
+    stages = {name: measure_stages(bench.builder, bench.samples, limits) for name, bench in benches.items()}
+    Console(width=100).print(stage_table(stages, limits, device))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,9 +20,10 @@ Work = tuple[Callable[[], object], int]
 """Something to time, and the number of samples that it is for."""
 
 PEERS = ("regressor", "rnea", "frame Jacobian", "projection")
-_ROWS: tuple[tuple[str, str, str, float | None], ...] = (
+ROWS = (
     ("Regressor, out=, 4096", "regressor", "4096", 0.7),
-    ("Regressor, out=, 4096, by zero_()", "zero 4096", "4096", 1.5),
+    ("the same by the time of zero_()", "zero 4096", "4096", 1.5),
+    ("the same on two threads", "regressor", "4096 on two threads", 0.7),
     ("Regressor, out=, 256", "regressor", "256", 0.7),
     ("Regressor, out=, 256, float32", "regressor", "256 single", 0.5),
     ("Regressor, forward and backward, 256", "regressor", "256 backward", 2.0),
@@ -63,6 +64,7 @@ class ModuleCase:
         (q, v, a) = (x.numpy() for x in self.state(256))
         foot = model.getFrameId(self.feet[0], pin.FrameType.BODY)
         (J, active, K, torque, _) = (x.numpy() for x in self.to_project(256))
+        K = np.ascontiguousarray(K)
         f = np.pad(torque, ((0, 0), (6, 0)))
 
         def regressors() -> None:
@@ -93,6 +95,8 @@ class ModuleCase:
         for samples in (1, 32, 256, 4096):
             works[str(samples)] = in_place(module, self.state(samples)), samples
         works["256 single"] = in_place(single, self.state(256, torch.float32)), 256
+        work, samples = works["4096"]
+        works["4096 on two threads"] = on_threads(2, work), samples
         memory = module(*self.state(4096)).permute(1, 2, 0)
         works["zero 4096"] = memory.zero_, 4096
         state = [x.requires_grad_() for x in self.state(256)]
@@ -137,6 +141,18 @@ def in_place(module: Regressor, state: tuple[Tensor, Tensor, Tensor]) -> Callabl
     return without_gradients(lambda: module(*state, out=out))
 
 
+def on_threads(count: int, work: Callable[[], object]) -> Callable[[], None]:
+    """The same, on so many threads."""
+
+    def run() -> None:
+        before = torch.get_num_threads()
+        torch.set_num_threads(count)
+        work()
+        torch.set_num_threads(before)
+
+    return run
+
+
 def without_gradients(work: Callable[[], object]) -> Callable[[], object]:
     """The same in inference mode."""
     return torch.inference_mode()(work)
@@ -146,8 +162,3 @@ def null_space(A: Array, size: int) -> Array:
     """Rows that span the null space of one matrix (k, size)."""
     _, singular, Vh = np.linalg.svd(A)
     return Vh[(singular > 1e-9 * singular.max(initial=0.0)).sum() :]
-
-
-def module_rows(medians: Mapping[str, float]) -> list[tuple[str, float, float, float | None]]:
-    """Title, time per sample [us], time as a share of the peer's, and the bar, of each row."""
-    return [(title, medians[name], medians[name] / medians[peer], bar) for title, peer, name, bar in _ROWS]

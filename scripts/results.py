@@ -15,6 +15,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from benchmark import modules_table, speed_table
 from default_accuracy import ridge_table
 from interval_coverage import coverage_table
 from legged_accuracy import accuracy_table
@@ -42,6 +43,8 @@ def tables(data: Path = _DATA) -> dict[str, Callable[[], Rows]]:
         "ridge": ridge_table,
         "intervals": coverage_table,
         "posterior": posterior_table,
+        "speed": speed_table,
+        "modules": modules_table,
     }
 
 
