@@ -1,5 +1,6 @@
 // Lanes: one number of each of some samples, 2 to 8 of float64, as many as fill a register of the processor.
 #pragma once
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 
@@ -20,7 +21,7 @@ template <class T> constexpr std::int64_t LANES = REGISTER / sizeof(T);
 
 // The numbers from `p` on, however it is aligned.
 template <class T> inline V<T> load(const T *p) {
-    V<T> v;
+    V<T> v = {};
     std::memcpy(&v, p, sizeof v);
     return v;
 }
@@ -30,6 +31,17 @@ template <class T> inline V<T> load(const T *p, std::int64_t n) {
     if (n >= LANES<T>) return load(p);
     V<T> v = {};
     for (std::int64_t k = 0; k < n; ++k) v[k] = p[k];
+    return v;
+}
+
+// The first `n` of the numbers that lie `step` apart, and zeros.
+template <class T> inline V<T> gather(const T *p, std::int64_t step, std::int64_t n) {
+    if (step == 1) return load(p, n);
+    V<T> v = {};
+    if (n < LANES<T>)
+        for (std::int64_t k = 0; k < n; ++k) v[k] = p[k * step];
+    else
+        for (std::int64_t k = 0; k < LANES<T>; ++k) v[k] = p[k * step];
     return v;
 }
 
@@ -43,6 +55,11 @@ template <class T> inline void store(T *p, const V<T> &v, std::int64_t n) {
 
 // One number in all lanes; NaN stays NaN.
 template <class T> inline V<T> fill(T x) { return V<T>{} + x; }
+
+template <class T> inline V<T> square_root(V<T> x) {
+    for (std::int64_t k = 0; k < LANES<T>; ++k) x[k] = std::sqrt(x[k]);
+    return x;
+}
 
 // The sum of all lanes, always in the same order.
 template <class T> inline T sum(const V<T> &v) {

@@ -17,12 +17,12 @@ struct Limbs {
 };
 
 // Write a limb's contact rows (k, 6 + k): unit wrenches at the base origin, then their power along each joint.
-void write_limb(const Limbs &limbs, const Int *limb, const State *states, Lanes *rows) {
-    const State &foot = states[limb[0]];
+void write_limb(const Limbs &limbs, const Int *limb, const Node *states, Lanes *rows) {
+    const Node &foot = states[limb[0]];
     const Int k = limb[1], width = BASE + k;
     for (Int number = 0; number < k; ++number) {
         const double *unit = limbs.wrenches + 6 * (limb[2] + number);
-        Spatial wrench = {turn(foot.rotation, unit[0], unit[1], unit[2]), turn(foot.rotation, unit[3], unit[4], unit[5])};
+        Screw<double> wrench = {foot.axes.out(constant(unit[0], unit[1], unit[2])), foot.axes.out(constant(unit[3], unit[4], unit[5]))};
         wrench.angular = wrench.angular + cross(foot.position, wrench.linear);
         Lanes *row = rows + number * width;
         std::memcpy(row, &wrench, sizeof wrench);
@@ -36,7 +36,7 @@ void write_limb(const Limbs &limbs, const Int *limb, const State *states, Lanes 
 void reflect(Lanes *rows, Int width, Int count, Int last) {
     Lanes square = {};
     for (Int row = 0; row < count; ++row) square += rows[row * width + last] * rows[row * width + last];
-    const Lanes root = square_root(square), first = rows[last];
+    const Lanes root = square_root<double>(square), first = rows[last];
     const Lanes length = first < 0.0 ? -root : root;
     rows[last] = first + length;
     const Lanes inverse = 1.0 / (length * rows[last]);
@@ -80,7 +80,7 @@ auto orthonormalize(Lanes *W, Int m, double least_pivot) {
         Lanes square = {};
         for (Int row = 0; row < m; ++row) square += W[row * BASE + column] * W[row * BASE + column];
         suspect |= ~(square > least_pivot * before[column]);
-        const Lanes inverse = 1.0 / square_root(square);
+        const Lanes inverse = 1.0 / square_root<double>(square);
         Lanes along[BASE] = {};
         for (Int row = 0; row < m; ++row) {
             W[row * BASE + column] *= inverse;
@@ -109,7 +109,7 @@ void scale_rows(Lanes *W, Int first, Int end, const double *row_std, bool divide
 extern "C" void write_bases(const Motion *motion, const Limbs *limbs, const double *axes, double worst, double least_pivot,
                             double *W, bool *suspect) {
     const Int m = limbs->dofs;
-    std::vector<State> states(motion->nodes);
+    std::vector<Node> states(motion->nodes);
     std::vector<Lanes> rows(BASE * 2 * BASE), basis(m * BASE);
     for (Int tile = 0; tile < motion->tiles; ++tile) {
         write_states(*motion, tile, states.data());

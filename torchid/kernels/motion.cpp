@@ -17,15 +17,6 @@ struct Log {
     const double *position, *velocity, *acceleration, *direction, *base[3];
 };
 
-Lanes gather(const double *values, Int step, Int count) {
-    Lanes out = {};
-    if (count < TILE)
-        for (Int t = 0; t < count; ++t) out[t] = values[t * step];
-    else
-        for (Int t = 0; t < TILE; ++t) out[t] = values[t * step];
-    return out;
-}
-
 // Sine and cosine of angles [rad], to 1e-16: reduced to at most pi / 4, then the polynomials of fdlibm.
 void write_sine_cosine(const Lanes &x, Lanes &sine, Lanes &cosine) {
     constexpr double LARGEST = 1e5, ROUND = 0x1.8p52; // adding the latter leaves an integer in a number's last bits

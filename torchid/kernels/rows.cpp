@@ -71,9 +71,9 @@ class Writer {
   private:
     const Motion &motion;
     const Rows &rows;
-    std::vector<State> states;
-    std::vector<Spatial> sums; // (path sums, most): of each row's W times the screw axes from the base to a node
-    Spatial wrenches[10];      // at the base origin, of a unit of each parameter of a body
+    std::vector<Node> states;
+    std::vector<Screw<double>> sums; // (path sums, most): of each row's W times the screw axes from the base to a node
+    Screw<double> wrenches[10];      // at the base origin, of a unit of each parameter of a body
     Int most = 0, tile = 0, to = 0, size = 0;
 
     template <bool whole> void write_tile(const Target &target) {
@@ -106,7 +106,7 @@ class Writer {
         const Lanes direction = motion.joint(DIRECTION, move.node, tile);
         for (Int row = 0; row < block.count; ++row) {
             const Lanes w = rows.ratios[number] * W(move.dof, block.first + row);
-            sums[move.path_sum * most + row] = sums[move.above * most + row] + w * states[move.node].screw;
+            sums[move.path_sum * most + row] = sums[move.above * most + row] + states[move.node].screw * w;
             put<whole>(target.at(block, move.column, row) + to, w * direction);
             put<whole>(target.at(block, move.column + 1, row) + to, w * velocity);
         }
@@ -120,7 +120,7 @@ class Writer {
         if (!number || body.node != rows.bodies[number - 1].node) write_wrenches(states[body.node], parameters, body.count);
         const Int step = target.step(block);
         for (Int row = 0; row < block.count; ++row) {
-            const Vector linear = sums[body.path_sum * most + row].linear, angular = sums[body.path_sum * most + row].angular;
+            const Vec<double> linear = sums[body.path_sum * most + row].linear, angular = sums[body.path_sum * most + row].angular;
             double *out = target.at(block, body.column, row) + to;
             for (Int k = 0; k < body.count; ++k, out += step) {
                 Lanes power = dot(wrenches[k].angular, angular);
@@ -131,16 +131,16 @@ class Writer {
     }
 
     // As `torchid.regressor.columns`: m a + alpha x h + omega x (omega x h), h x a + I alpha + omega x (I omega).
-    void write_wrenches(const State &state, const Int *parameters, Int count) {
-        const Vector a = turn_back(state.rotation, state.alpha), f = turn_back(state.rotation, state.force);
-        const Vector w = turn_back(state.rotation, state.omega);
+    void write_wrenches(const Node &state, const Int *parameters, Int count) {
+        const Vec<double> a = state.axes.in(state.alpha), f = state.axes.in(state.force);
+        const Vec<double> w = state.axes.in(state.omega);
         const Lanes xx = w.x * w.x, yy = w.y * w.y, zz = w.z * w.z, xy = w.x * w.y, xz = w.x * w.z, yz = w.y * w.z;
         const Lanes zero = {};
-        const Vector forces[INERTIA] = {f,
+        const Vec<double> forces[INERTIA] = {f,
                                         {-yy - zz, a.z + xy, xz - a.y},
                                         {xy - a.z, -zz - xx, a.x + yz},
                                         {a.y + xz, yz - a.x, -xx - yy}};
-        const Vector moments[10] = {{},
+        const Vec<double> moments[10] = {{},
                                     {zero, -f.z, f.y},
                                     {f.z, zero, -f.x},
                                     {-f.y, f.x, zero},
@@ -151,10 +151,10 @@ class Writer {
                                     {yy - zz, a.z - xy, a.y + xz},
                                     {yz, -xz, a.z}};
         for (Int k = 0; k < count; ++k) {
-            Spatial &wrench = wrenches[k];
-            wrench.angular = turn(state.rotation, moments[parameters[k]]);
+            Screw<double> &wrench = wrenches[k];
+            wrench.angular = state.axes.out(moments[parameters[k]]);
             if (parameters[k] < INERTIA) {
-                wrench.linear = turn(state.rotation, forces[parameters[k]]);
+                wrench.linear = state.axes.out(forces[parameters[k]]);
                 wrench.angular = wrench.angular + cross(state.position, wrench.linear);
             }
         }
