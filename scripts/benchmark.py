@@ -215,7 +215,6 @@ def measure(case: Case, count: int, repeats: int, device: torch.device) -> dict[
     pipelines: dict[str, tuple[Callable[[], object], int]] = {
         "regressor alone, Pinocchio": (lambda: per_sample.regressors(few), len(few)),
         "`lstsq`, Pinocchio and NumPy sample by sample": (lambda: per_sample.by_stack(few), len(few)),
-        "Gram matrix, Pinocchio and NumPy sample by sample": (lambda: per_sample.by_gram(few), len(few)),
         "torchid, one thread": (on_threads(1, bench.fit), count),
         "torchid": (bench.fit, count),
     }
@@ -243,7 +242,7 @@ def modules_table(repeats: int = 15) -> Rows:
         works |= {f"{case.name} {name}": repeated(*work) for name, work in timed.works().items()}
     with ThreadpoolController().limit(limits=1):
         measured = medians(works, repeats)
-    yield "share of the time of Pinocchio or NumPy", *(case.name for case in cases), "at most"
+    yield "batch", *(case.name for case in cases), "aim"
     for title, peer, name, most in ROWS:
         shares = (measured[f"{case.name} {name}"] / measured[f"{case.name} {peer}"] for case in cases)
         yield title, *(f"{share:.2f}" for share in shares), f"{most:g}"
