@@ -216,6 +216,19 @@ def test_two_threads_give_the_same_bits(dtype: torch.dtype) -> None:
         assert all(map(torch.equal, one, two))
 
 
+def test_gradients_of_parameters_alone_are_those_beside_others(small: Robot) -> None:
+    (q, v, a, phi) = arguments(small, 5, 46)
+    module = InverseDynamics(small)
+    for parameters in (phi, phi[0].detach().requires_grad_()):
+        expected = torch.autograd.grad(module(q, v, a, parameters).square().sum(), [q, parameters])[1]
+        alone = module(q.detach(), v.detach(), a.detach(), parameters).square().sum()
+        assert torch.equal(torch.autograd.grad(alone, parameters)[0], expected)
+
+
+def test_a_module_without_kernels_says_why(small: Robot) -> None:
+    assert ("without a compiler" in repr(Regressor(small))) == (kernels.compiled() is None)
+
+
 def test_a_copy_is_differentiated_twice_without_the_original(small: Robot) -> None:
     module = copy.deepcopy(InverseDynamics(small))
     (q, v, a, phi) = arguments(small, 2, 44)

@@ -37,12 +37,12 @@ template <class T> inline V<T> load(const T *p, std::int64_t n) {
 // The first `n` of the numbers that lie `step` apart, and zeros.
 template <class T> inline V<T> gather(const T *p, std::int64_t step, std::int64_t n) {
     if (step == 1) return load(p, n);
-    V<T> v = {};
+    T x[LANES<T>] = {};
     if (n < LANES<T>)
-        for (std::int64_t k = 0; k < n; ++k) v[k] = p[k * step];
+        for (std::int64_t k = 0; k < n; ++k) x[k] = p[k * step];
     else
-        for (std::int64_t k = 0; k < LANES<T>; ++k) v[k] = p[k * step];
-    return v;
+        for (std::int64_t k = 0; k < LANES<T>; ++k) x[k] = p[k * step];
+    return load(x);
 }
 
 template <class T> inline void store(T *p, const V<T> &v) { std::memcpy(p, &v, sizeof v); }

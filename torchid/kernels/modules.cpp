@@ -399,12 +399,13 @@ void states_grad(const Robot<T> &robot, const Call<T> &call, Batch<T> &batch, st
     Attitude<T>(batch.q, robot.gravity).grad(zero<T>() - g.force, g_q);
 }
 
-// Gradients of what `dynamics` writes, by q, v, a and, with parameters, by these: (samples, columns)
+// Gradients of what `dynamics` writes, by q, v, a (unless null) and, with parameters, by these: (samples, columns)
 template <class T> void dynamics_grad(const Robot<T> &robot, const Call<T> &call, Index begin, Index end) {
     Batch<T> batch;
     for (Index start = begin; start < end; start += LANES<T>) {
         set_states(robot, call, start, batch);
         batch.g_joints.assign(robot.nodes.size(), State<T>{});
+        const bool of_state = call.g_q; // and not of the parameters alone
         const Index count = batch.q.count;
         const T *grads = call.grad + start * call.grad_sample, *phi = call.phi + start * call.phi_step;
         const Output<T> g_phi{call.g_phi, robot.columns, start, count};
@@ -422,8 +423,8 @@ template <class T> void dynamics_grad(const Robot<T> &robot, const Call<T> &call
                 const T *row = grads + term->row * call.grad_row;
                 if (call.phi) {
                     const V<T> torque = gather(row, call.grad_sample, count);
-                    total.linear += s.linear * torque, total.angular += s.angular * torque;
-                    row_screw_grad(robot, term, frame, {need.linear * torque, need.angular * torque}, g, batch);
+                    total = total + s * torque;
+                    if (of_state) row_screw_grad(robot, term, frame, need * torque, g, batch);
                 } else {
                     const Ten<T> weights = ten(node, row, call.grad_column, call.grad_sample, count);
                     felt_grad(s, weights, frame, g);
@@ -432,12 +433,12 @@ template <class T> void dynamics_grad(const Robot<T> &robot, const Call<T> &call
                 while (term->more) ++term;
             }
             if (call.phi) {
-                felt_grad(total, p, frame, g);
+                if (of_state) felt_grad(total, p, frame, g);
                 each_of(felt(total, frame), false, [&](int k, const V<T> &x) {
                     if (node.columns[k] >= 0) g_phi.set(node.columns[k], x);
                 });
             }
-            on_node_grad(batch.joints[i], frame, node.link, node.framed, g, batch.g_joints[i]);
+            if (of_state) on_node_grad(batch.joints[i], frame, node.link, node.framed, g, batch.g_joints[i]);
             if (!node.moves) continue;
             const V<T> velocity = batch.motion[i].velocity, along = direction(robot, velocity);
             const V<T> slope = robot.width > 0 ? (T(1) - along * along) / robot.width : V<T>{};
@@ -454,7 +455,7 @@ template <class T> void dynamics_grad(const Robot<T> &robot, const Call<T> &call
             }
             of_joints[3 * node.dof + 1] += torque * (coulomb * slope + viscous) * node.ratio;
         }
-        states_grad(robot, call, batch, of_joints);
+        if (of_state) states_grad(robot, call, batch, of_joints);
     }
 }
 

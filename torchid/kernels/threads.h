@@ -2,6 +2,7 @@
 #pragma once
 #include <algorithm>
 #include <cstdint>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -13,7 +14,13 @@ template <class Work> void in_threads(int64_t samples, int64_t step, int64_t thr
         work(groups * k / parts * step, std::min(samples, groups * (k + 1) / parts * step));
     };
     std::vector<std::thread> others;
-    for (int64_t k = 1; k < parts; ++k) others.emplace_back(part, k);
+    for (int64_t k = 1; k < parts; ++k) {
+        try {
+            others.emplace_back(part, k);
+        } catch (const std::system_error &) { // no more threads are allowed
+            part(k);
+        }
+    }
     part(0);
     for (auto &other : others) other.join();
 }

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 
 from torchid import parameters
-from torchid.kernels import compiled
+from torchid.kernels import compiled, why_not_compiled
 from torchid.parameters import Array
 from torchid.regressor.tree import KinematicTree
 
@@ -105,6 +105,10 @@ class Referenced(nn.Module):
         """Whether operators compute something of such a tensor."""
         return self.has_kernels and x.is_cpu and x.dtype in (torch.float64, torch.float32)
 
+    def extra_repr(self) -> str:
+        """What `repr` says."""
+        return "" if self.has_kernels else why_not_compiled()
+
     def reference(self, *arguments: Tensor) -> Tensor:
         """The operator's result, by torch's operators."""
         raise NotImplementedError
@@ -160,14 +164,18 @@ def _imagine(*arguments: Any) -> Tensor:
     return inputs[0].new_empty(_shape(inputs, rows, columns))
 
 
-def _gradients(grad: Tensor, inputs: list[Tensor], table: Tensor, reals: Tensor) -> list[Tensor]:
-    """Gradients of the inputs, by that of what `_compute` makes of them; of parameters for each sample."""
+def _gradients(grad: Tensor, inputs: list[Tensor], table: Tensor, reals: Tensor, of_state: bool) -> list[Tensor]:
+    """Gradients of the inputs, by that of what `_compute` makes of them; of parameters for each sample.
+
+    `of_state`: whether those of q, v and a are wanted; else they are not computed.
+    """
     out = [x.new_zeros(len(inputs[0]), x.shape[-1]) for x in inputs]
     names = (
         ("grad_sample", "grad_row", "grad_column") if len(inputs) == 4 else ("grad_row", "grad_column", "grad_sample")
     )
     fields = dict(zip(names, grad.stride(), strict=False))
-    fields |= {f"g_{name}": x.data_ptr() for name, x in zip(_INPUTS, out, strict=False)}
+    wanted = zip(_INPUTS, out, strict=False) if of_state else [("phi", out[-1])]
+    fields |= {f"g_{name}": x.data_ptr() for name, x in wanted}
     _run(inputs, table, reals, grad=grad.data_ptr(), **fields)
     return out
 
@@ -199,7 +207,8 @@ class _Differentiable(torch.autograd.Function):
         if torch.is_grad_enabled():  # to be differentiated again
             gradients = torch.func.vjp(_references[ctx.number].reference, *inputs)[1](grad)
         else:
-            gradients = torch.ops.torchid.gradients(grad, inputs, table, reals)
+            of_state = any(ctx.needs_input_grad[-5 - len(inputs) :][:3])
+            gradients = torch.ops.torchid.gradients(grad, inputs, table, reals, of_state)
             gradients = [g.sum(0) if x.ndim == 1 else g for g, x in zip(gradients, inputs, strict=True)]
         return (None, *gradients, None, None, None, None, None)
 
@@ -256,11 +265,11 @@ def _operator(name: str, inputs: int) -> Operator:
     return operator
 
 
-_library.define("gradients(Tensor grad, Tensor[] inputs, Tensor table, Tensor reals) -> Tensor[]")
+_library.define("gradients(Tensor grad, Tensor[] inputs, Tensor table, Tensor reals, bool of_state) -> Tensor[]")
 _library.impl("gradients", _gradients, "CPU")
 torch.library.register_fake(
     "torchid::gradients",
-    lambda grad, inputs, table, reals: [x.new_empty(inputs[0].shape[0], x.shape[-1]) for x in inputs],
+    lambda grad, inputs, table, reals, of_state: [x.new_empty(inputs[0].shape[0], x.shape[-1]) for x in inputs],
     lib=_library,
 )
 
