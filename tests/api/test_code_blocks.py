@@ -139,10 +139,9 @@ def test_python_of_the_pages_runs(page: str, folder: Path, monkeypatch: pytest.M
     monkeypatch.setattr(torchid, "Sgd", _two_epochs)
     for name, text in {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "0", "RANK": "0", "WORLD_SIZE": "1"}.items():
         monkeypatch.setenv(name, text)  # as torchrun sets them for one process
-    said = {"torchid": torchid} if page == "python.md" else beside(folder, page)
+    said = beside(folder, page)
     for block in (x.values[1] for x in blocks("python") if x.values[0] == page):
-        with torch.compiler.set_stance("force_eager"):  # to compile takes 20 s
-            exec(compile(str(block), page, "exec"), said)
+        exec(compile(str(block), page, "exec"), said)
     if page == "simulation.md":
         robot, model = said["robot"], said["model"]
         assert model.nv == robot.nv
