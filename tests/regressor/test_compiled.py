@@ -109,8 +109,13 @@ def test_memory_is_written_again(small: Robot) -> None:
     assert out.data_ptr() == address
     K(*(x.reshape(2, 3, -1) for x in (q, v, a)), out=out.unflatten(0, (2, 3)))
     assert torch.equal(out, K(q, v, a))
-    with pytest.raises(ValueError, match="out: found shape .*; accepted: what an earlier call returned for 6 samples"):
-        K(q, v, a, out=out[:5])
+    for wrong in (out[:5], out.unflatten(0, (2, 3))):
+        with pytest.raises(
+            ValueError, match=r"out: found shape .*; accepted: what an earlier call returned for sample"
+        ):
+            K(q, v, a, out=wrong)
+    with pytest.raises(TypeError, match="out: found ndarray; accepted: a tensor that an earlier call returned"):
+        K(q, v, a, out=out.numpy())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="accepted: what an earlier call returned"):
         K(q, v, a, out=out.contiguous())
     with pytest.raises(TypeError, match="out: found torch.float32; accepted: torch.float64"):
@@ -119,11 +124,35 @@ def test_memory_is_written_again(small: Robot) -> None:
         K(q.requires_grad_(), v, a, out=out)
 
 
+def test_memory_of_any_content_gives_the_right_result(small: Robot, tmp_path: Path) -> None:
+    (q, v, a, _) = (x.detach() for x in arguments(small, 6, 47))
+    other = tmp_path / "other.urdf"
+    other.write_text(small.path.read_text().replace('<parent link="c"/>', '<parent link="base"/>'))
+    K = Regressor(small)
+    expected = K(q, v, a)
+    touched = K(q, v, a).add_(1.0)
+    for out in (torch.full_like(expected, 7.0), touched, Regressor(load(other))(q, v, a), expected.clone()):
+        assert torch.equal(K(q, v, a, out=out), expected)
+
+
+def test_memory_that_a_gradient_needs_is_missed(small: Robot) -> None:
+    (q, v, a, phi) = (x.detach() for x in arguments(small, 6, 48))
+    K = Regressor(small)
+    phi = phi.requires_grad_()
+    out = K(q, v, a)
+    loss = (out * phi[:, None]).sum(-1).square().mean()
+    K(q, v, a, out=out)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
 def test_parameters_of_another_shape_are_refused(small: Robot) -> None:
     (q, v, a, phi) = arguments(small, 3, 38)
     for wrong in (phi[:2], phi[:, 1:], phi[None], phi[0, :-1]):
         with pytest.raises(ValueError, match=r"phi: found shape .*; accepted: \(60,\) or \(3, 60\)"):
             InverseDynamics(small)(q, v, a, wrong)
+    with pytest.raises(TypeError, match="phi: found ndarray; accepted: a tensor"):
+        InverseDynamics(small)(q, v, a, phi.detach().numpy())  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="phi: found torch.float32; accepted: torch.float64"):
         InverseDynamics(small)(q, v, a, phi.float())
 

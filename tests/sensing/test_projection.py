@@ -288,6 +288,19 @@ def test_memory_of_a_padded_projection_is_written_again() -> None:
         project(*fewer, pad=True, out=out)
 
 
+@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
+def test_a_missing_number_stays_in_its_sample(noise: float | None) -> None:
+    scene = Scene(robot_of(ANYMAL), FEET, 18)
+    scene.touching[:] = True
+    project = Projection([True] * 12, [False] * 12, 6, noise, noise, noise)
+    expected = scene.project(project, pad=True)
+    scene.J[3, 2, 8] = torch.nan
+    found = scene.project(project, pad=True)
+    good = torch.arange(12) != 3
+    assert found.K[3].isnan().all()
+    torch.testing.assert_close(found.K[good].mT @ found.K[good], expected.K[good].mT @ expected.K[good])
+
+
 SOLOS_FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]
 
 

@@ -117,6 +117,22 @@ class Referenced(nn.Module):
 _references: WeakValueDictionary[int, Referenced] = WeakValueDictionary()
 
 
+def marked(out: Tensor, number: int) -> Tensor:
+    """The tensor, with a mark that says which module wrote it last, and its version then."""
+    if not torch.compiler.is_compiling():
+        out.__dict__["torchid_writer"] = number, _version(out)
+    return out
+
+
+def is_marked(out: Tensor, number: int) -> bool:
+    """Whether a module wrote a tensor, and nobody since; writes in inference mode go unnoticed."""
+    return not torch.compiler.is_compiling() and out.__dict__.get("torchid_writer") == (number, _version(out))
+
+
+def _version(x: Tensor) -> int:
+    return -1 if x.is_inference() else x._version
+
+
 class _Call(ctypes.Structure):
     """`Call` in `kernels/modules.cpp`."""
 

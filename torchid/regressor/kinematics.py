@@ -190,7 +190,9 @@ def require_precision(tree: KinematicTree, tensors: Mapping[str, Tensor | None])
         for what in ("dtype", "device"):
             expected = getattr(like, what)
             if (actual := getattr(x, what)) != expected:
-                accepted = f"{expected} (the module's {what}); convert {name}, or the module with .to({actual})"
+                accepted = f"{expected} (the module's {what}); convert {name}"
+                if x.dtype.is_floating_point:
+                    accepted += f", or the module with .to({actual})"
                 raise TypeError(f"{name}: found {actual}; accepted: {accepted}")
 
 

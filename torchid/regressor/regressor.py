@@ -17,6 +17,8 @@ from torchid.regressor.compiled import (
     call,
     frame_jacobian,
     inverse_dynamics,
+    is_marked,
+    marked,
     regressor,
     robot_tables,
     write_regressor,
@@ -98,8 +100,8 @@ class Regressor(Referenced):
                 joint positions [rad or m]; (..., n) for a fixed base. Any number of leading dimensions, or none.
             v: (..., nv): base linear and angular velocity in the base frame [m/s, rad/s], joint velocities.
             a: (..., nv): time derivative of `v`.
-            out: what an earlier call returned for as many samples; is written and returned. Constant zeros of K are not
-                written again, and no memory is allocated.
+            out: what an earlier call returned for arguments of these shapes; is written and returned, and no memory is
+                allocated. If it is as this module left it, constant zeros of K are not written again.
 
         Returns:
             (..., nv + 6 F, 12 L) for L bodies and F limb force/torque sensors. It is a strided view of a batch-last
@@ -112,16 +114,20 @@ class Regressor(Referenced):
         """
         samples, state = self.batch(q, v, a)
         constants = self.table, self.reals
-        if out is not None:
-            K = self._memory(out, state)
-            if self.runs_compiled(q):
-                write_regressor(*state, *constants, K)
-            else:
-                K.copy_(self.reference(*state))
-            return out
         compiled = self.runs_compiled(q)
-        K = call(regressor, *state, *constants, *self.shape, self.number) if compiled else self.reference(*state)
-        return K.permute(2, 0, 1).reshape(*samples, *self.shape)
+        if out is None:
+            K = call(regressor, *state, *constants, *self.shape, self.number) if compiled else self.reference(*state)
+            return marked(K.permute(2, 0, 1).reshape(*samples, *self.shape), self.number)
+        K = self._memory(out, samples, state)
+        if compiled:
+            if not is_marked(out, self.number):
+                K.zero_()
+            write_regressor(*state, *constants, K)
+            if not out.is_inference():
+                torch.autograd.graph.increment_version(out)
+        else:
+            K.copy_(self.reference(*state))
+        return marked(out, self.number)
 
     def batch(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[torch.Size, tuple[Tensor, Tensor, Tensor]]:
         """Leading dimensions of generalized coordinates, and these as (B, width) each; errors as of `forward`."""
@@ -140,18 +146,19 @@ class Regressor(Referenced):
         motion = motion_from_state(q, v, a, self.tree.n, not self.tree.base_rows, self.gravity)
         return self.from_motion(motion).permute(1, 2, 0)
 
-    def _memory(self, out: Tensor, state: Sequence[Tensor]) -> Tensor:
+    def _memory(self, out: Tensor, samples: torch.Size, state: Sequence[Tensor]) -> Tensor:
         """`out` as (rows, columns, B), contiguous."""
+        if not isinstance(out, Tensor):
+            raise TypeError(f"out: found {type(out).__name__}; accepted: a tensor that an earlier call returned")
         if torch.is_grad_enabled() and any(x.requires_grad for x in (*state, out)):
             raise TypeError("out: found arguments that require a gradient; accepted: no out, or torch.no_grad()")
         require_precision(self.tree, {"out": out})
-        samples = len(state[0])
-        if out.numel() == samples * self.shape[0] * self.shape[1]:
-            K = out.reshape(samples, *self.shape).permute(1, 2, 0)
+        if out.shape == (*samples, *self.shape):
+            K = out.reshape(len(state[0]), *self.shape).permute(1, 2, 0)
             if K.is_contiguous():
                 return K
         shape = f"shape {tuple(out.shape)}, strides {out.stride()}"
-        raise ValueError(f"out: found {shape}; accepted: what an earlier call returned for {samples} samples")
+        raise ValueError(f"out: found {shape}; accepted: what an earlier call returned for samples {tuple(samples)}")
 
     def from_motion(self, motion: Motion) -> Tensor:
         """Compute the regressor, (B, nv + 6 F, 12 L), from a `Motion`, by torch's operators."""
@@ -210,6 +217,8 @@ class InverseDynamics(Referenced):
         """
         module = self.regressor
         samples, state = module.batch(q, v, a)
+        if not isinstance(phi, Tensor):
+            raise TypeError(f"phi: found {type(phi).__name__}; accepted: a tensor")
         columns = module.shape[1]
         require_precision(module.tree, {"phi": phi})
         if phi.shape[-1:] != (columns,) or phi.shape[:-1] not in (samples, ()):

@@ -48,10 +48,11 @@ class Sensors:
     def basis(self, J: Tensor, active: Tensor) -> Tensor:
         """Orthonormal bases of the null spaces of unmeasured forces, (..., m, m), by singular values; no gradient."""
         A = self.blocked(J, active).detach()
-        _, values, Vh = torch.linalg.svd(A, full_matrices=True)
+        is_number = A.isfinite().all(-1).all(-1)[..., None, None]
+        _, values, Vh = torch.linalg.svd(A.nan_to_num(0.0, 0.0, 0.0), full_matrices=True)
         values = torch.nn.functional.pad(values, (0, A.shape[-1] - values.shape[-1]))
         negligible = (self.tolerance * values[..., :1]).clamp_min(self.floor)
-        return Vh.mT * (values <= negligible)[..., None, :]
+        return torch.where(is_number, Vh.mT * (values <= negligible)[..., None, :], torch.nan)
 
     def blocked(self, J: Tensor, active: Tensor) -> Tensor:
         """Rows A of unmeasured forces that act, (..., k, m), in units of the noise; zero where they do not."""
@@ -64,7 +65,7 @@ class Sensors:
         The projection onto the null space of A does not change them; to first order dV = -A^+ dA V (Golub, Pereyra
         1973).
         """
-        A = self.blocked(J, active)
+        A = self.blocked(J, active).nan_to_num(0.0, 0.0, 0.0)  # where it is no number, nor is the basis
         inverse = torch.linalg.pinv(A, atol=self.floor, rtol=self.tolerance)
         basis = basis - inverse @ (A @ basis)
         covariance = basis.mT @ basis + torch.diag_embed((basis == 0.0).all(-2).to(basis.dtype))
@@ -73,7 +74,7 @@ class Sensors:
             acting = torch.where(active[..., self.measured, None], J[..., self.measured, :], 0.0)
             through = (acting[..., self.kept] @ W) * self.wrench_std[:, None]
             covariance = covariance + through.mT @ through
-        W = torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), W.mT, upper=False).mT
+        W = torch.linalg.solve_triangular(torch.linalg.cholesky_ex(covariance).L, W.mT, upper=False).mT
         V = W.new_zeros(*W.shape[:-2], J.shape[-1], W.shape[-1])
         return V.index_copy(-2, self.kept, W)
 
@@ -129,6 +130,7 @@ def _write(
     sensors = Sensors(kept, unmeasured, measured, row_std, wrench_std, base_rows, floor, tolerance)
     suspect = active.new_empty(len(J))
     J, active, torque, wrench = (x.contiguous() for x in (J, active, torque, wrench))
+    out[0].zero_()
     call = _Call(
         samples=len(J),
         rows=J.shape[2],
@@ -175,7 +177,6 @@ def _project(
     tolerance: float,
 ) -> list[Tensor]:
     out = _imagine(J, active, K, torque, wrench, constants)
-    out[0].zero_()
     _write(J, active, K, torque, wrench, constants, base_rows, floor, tolerance, out)
     return out
 

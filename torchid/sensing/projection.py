@@ -254,6 +254,9 @@ class Projection(nn.Module):
                 memory = project(*inputs)
             else:
                 write_projection(*inputs, memory)
+                for x in memory:
+                    if not x.is_inference():
+                        torch.autograd.graph.increment_version(x)
             V, projected, f = (x.reshape(*samples, *x.shape[1:]) for x in memory)
             if differentiable:
                 basis = V[..., sensors.kept, :] * sensors.row_std[:, None]
