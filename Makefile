@@ -47,7 +47,7 @@ clean:
 
 .venv/ready: pyproject.toml constraints.txt setup.py $(wildcard torchid/kernels/*.cpp torchid/kernels/*.h)
 	$(PYTHON) -m venv .venv
-	$(PIP) install -q -c constraints.txt torch
+	$(PIP) install -q --no-compile -c constraints.txt torch  # Python compiles what is imported of it
 	$(PIP) install -q -c constraints.txt -e '.[tables]'
 	touch $@
 
