@@ -258,8 +258,10 @@ template <class T> struct Batch { // lanes of samples, and what is known of them
 };
 
 template <class T> struct Call { // arguments of a call; strides in numbers
-    const T *q, *v, *a, *phi, *grad;
-    Index samples, phi_step, grad_sample, grad_row, grad_column;
+    const T *q, *v, *a, *phi;
+    Index samples, phi_step;
+    const T *grad;
+    Index grad_sample, grad_row, grad_column;
     T *out, *g_q, *g_v, *g_a, *g_phi;
 };
 

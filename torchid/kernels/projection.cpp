@@ -18,9 +18,9 @@ template <class T> struct Project { // arguments of a call; strides in numbers
     const bool *active;
     const Index *kept, *unmeasured, *measured; // rows of the dynamics, and of J
     Index samples, rows, base, k, m, n_unmeasured, n_measured, columns, K_sample, K_row, K_column;
-    double floor, tolerance; // of singular values, absolute and as a share of the largest
-    T *V, *K_out, *f;        // (samples, rows, m), (samples, m, columns), (samples, m)
-    bool *suspect;           // samples that may have lost rank: their basis is not to be used
+    const double *negligible; // singular values: an absolute one, and a share of the largest
+    T *V, *K_out, *f;         // (samples, rows, m), (samples, m, columns), (samples, m)
+    bool *suspect;            // samples that may have lost rank: their basis is not to be used
 };
 
 // Numbers of J of some lanes, zero where a contact is not active
@@ -79,7 +79,7 @@ template <class T> void null_basis(const Contact<T> &contact, std::vector<V<T>> 
         for (Index j = 0; j <= i; ++j) spread += inverse[j * k + i] * inverse[j * k + i];
     }
     for (Index s = 0; s < contact.count; ++s) {
-        const T negligible = T(std::max(p.floor, p.tolerance * std::sqrt(double(size[s]))));
+        const T negligible = T(std::max(p.negligible[0], p.negligible[1] * std::sqrt(double(size[s]))));
         suspect[s] = k > 0 && !(negligible * std::sqrt(spread[s]) < T(1e-3)); // so written, NaN is suspect
     }
     std::fill(W.begin(), W.end(), V<T>{});

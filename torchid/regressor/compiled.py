@@ -6,7 +6,6 @@ and the number of a `Referenced`.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import chain, pairwise
@@ -18,8 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
-from torchid import parameters
-from torchid.kernels import compiled, why_not_compiled
+from torchid import kernels, parameters
 from torchid.parameters import Array
 from torchid.regressor.tree import KinematicTree
 
@@ -98,7 +96,7 @@ class Referenced(nn.Module):
 
     def _register(self) -> None:
         self.number = id(self)
-        self.has_kernels = compiled() is not None
+        self.has_kernels = kernels.compiled() is not None
         _references[self.number] = self
 
     def runs_compiled(self, x: Tensor) -> bool:
@@ -107,7 +105,7 @@ class Referenced(nn.Module):
 
     def extra_repr(self) -> str:
         """What `repr` says."""
-        return "" if self.has_kernels else why_not_compiled()
+        return "" if self.has_kernels else kernels.why_not_compiled()
 
     def reference(self, *arguments: Tensor) -> Tensor:
         """The operator's result, by torch's operators."""
@@ -133,29 +131,18 @@ def _version(x: Tensor) -> int:
     return -1 if x.is_inference() else x._version
 
 
-class _Call(ctypes.Structure):
-    """`Call` in `kernels/modules.cpp`."""
-
-    _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("q", "v", "a", "phi", "grad")),
-        *((name, ctypes.c_int64) for name in ("samples", "phi_step", "grad_sample", "grad_row", "grad_column")),
-        *((name, ctypes.c_void_p) for name in ("out", "g_q", "g_v", "g_a", "g_phi")),
-    ]
-
-
 _INPUTS = ("q", "v", "a", "phi")
 
 
-def _run(inputs: Sequence[Tensor], table: Tensor, reals: Tensor, **fields: int) -> None:
-    q = inputs[0]
-    call = _Call(samples=len(q), phi_step=0 if inputs[-1].ndim == 1 else inputs[-1].shape[1], **fields)
-    inputs = [x.contiguous() for x in inputs]
-    for name, x in zip(_INPUTS, inputs, strict=False):
-        setattr(call, name, x.data_ptr())
-    kernel = "frame" if len(inputs) == 1 else "dynamics"
-    function = getattr(compiled(), f"torchid_{kernel}_{'float64' if q.dtype == torch.float64 else 'float32'}")
-    constants = ctypes.c_void_p(table.data_ptr()), ctypes.c_void_p(reals.data_ptr())
-    function(*constants, ctypes.byref(call), ctypes.c_int64(torch.get_num_threads()))
+def _run(inputs: Sequence[Tensor], table: Tensor, reals: Tensor, *rest: kernels.Word) -> None:
+    """Call a kernel; `rest`: the fields of `Call` in `kernels/modules.cpp` after its inputs and their sizes."""
+    (q, last) = (inputs[0], inputs[-1])
+    fields: list[kernels.Word] = [x.contiguous() for x in inputs]
+    fields += [0] * (len(_INPUTS) - len(inputs))
+    sizes = len(q), 0 if last.ndim == 1 else last.shape[1]
+    kind = "frame" if len(inputs) == 1 else "dynamics"
+    name = f"torchid_{kind}_{str(q.dtype).removeprefix('torch.')}"
+    kernels.call(name, table, reals, (*fields, *sizes, *rest), torch.get_num_threads())
 
 
 def _shape(inputs: Sequence[Tensor], rows: int, columns: int) -> tuple[int, ...]:
@@ -165,7 +152,7 @@ def _shape(inputs: Sequence[Tensor], rows: int, columns: int) -> tuple[int, ...]
 
 def _write(*arguments: Any) -> None:
     *inputs, table, reals, out = arguments
-    _run(inputs, table, reals, out=out.data_ptr())
+    _run(inputs, table, reals, 0, 0, 0, 0, out, 0, 0, 0, 0)
 
 
 def _compute(*arguments: Any) -> Tensor:
@@ -186,13 +173,11 @@ def _gradients(grad: Tensor, inputs: list[Tensor], table: Tensor, reals: Tensor,
     `of_state`: whether those of q, v and a are wanted; else they are not computed.
     """
     out = [x.new_zeros(len(inputs[0]), x.shape[-1]) for x in inputs]
-    names = (
-        ("grad_sample", "grad_row", "grad_column") if len(inputs) == 4 else ("grad_row", "grad_column", "grad_sample")
-    )
-    fields = dict(zip(names, grad.stride(), strict=False))
-    wanted = zip(_INPUTS, out, strict=False) if of_state else [("phi", out[-1])]
-    fields |= {f"g_{name}": x.data_ptr() for name, x in wanted}
-    _run(inputs, table, reals, grad=grad.data_ptr(), **fields)
+    (first, second, third) = (*grad.stride(), 0)[:3]
+    strides = (first, second, third) if len(inputs) == 4 else (third, first, second)  # of samples, rows, columns
+    wanted: list[kernels.Word] = [x if of_state or name == "phi" else 0 for name, x in zip(_INPUTS, out, strict=False)]
+    wanted += [0] * (len(_INPUTS) - len(inputs))
+    _run(inputs, table, reals, grad.data_ptr(), *strides, 0, *wanted)
     return out
 
 

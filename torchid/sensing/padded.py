@@ -6,15 +6,15 @@ may have lost rank, and all where there is no kernel.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.kernels import compiled
+from torchid import kernels
 
 _library = torch.library.Library("torchid", "FRAGMENT")
 
@@ -101,19 +101,6 @@ class Sensors:
         return V, *self.products(V, J, active, K, torque, wrench)
 
 
-class _Call(ctypes.Structure):
-    """`Project` in `kernels/projection.cpp`; its numbers have the precision of the samples."""
-
-    _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("J", "row_std", "wrench_std", "torque", "wrench", "K")),
-        *((name, ctypes.c_void_p) for name in ("active", "kept", "unmeasured", "measured")),
-        *((name, ctypes.c_int64) for name in ("samples", "rows", "base", "k", "m", "n_unmeasured", "n_measured")),
-        *((name, ctypes.c_int64) for name in ("columns", "K_sample", "K_row", "K_column")),
-        *((name, ctypes.c_double) for name in ("floor", "tolerance")),
-        *((name, ctypes.c_void_p) for name in ("V", "K_out", "f", "suspect")),
-    ]
-
-
 def _write(
     J: Tensor,
     active: Tensor,
@@ -131,31 +118,14 @@ def _write(
     suspect = active.new_empty(len(J))
     J, active, torque, wrench = (x.contiguous() for x in (J, active, torque, wrench))
     out[0].zero_()
-    call = _Call(
-        samples=len(J),
-        rows=J.shape[2],
-        base=base_rows,
-        k=J.shape[1],
-        m=len(sensors.kept),
-        n_unmeasured=len(sensors.unmeasured),
-        n_measured=len(sensors.measured),
-        columns=K.shape[2],
-        K_sample=K.stride(0),
-        K_row=K.stride(1),
-        K_column=K.stride(2),
-        floor=floor,
-        tolerance=tolerance,
-    )
-    pointers = {"J": J, "active": active, "K": K, "torque": torque, "wrench": wrench, "suspect": suspect}
-    pointers |= {name: getattr(sensors, name) for name in ("kept", "unmeasured", "measured", "row_std")}
-    pointers |= dict(zip(("V", "K_out", "f"), out, strict=True))
-    if len(sensors.wrench_std):
-        pointers["wrench_std"] = sensors.wrench_std
-    for name, x in pointers.items():
-        setattr(call, name, x.data_ptr())
-    function = getattr(compiled(), f"torchid_projection_{str(K.dtype).removeprefix('torch.')}")
-    if call.n_unmeasured <= call.m:
-        function(ctypes.byref(call), ctypes.c_int64(torch.get_num_threads()))
+    std: kernels.Word = wrench_std if len(wrench_std) else 0
+    inputs: list[kernels.Word] = [J, row_std, std, torque, wrench, K.data_ptr(), active]
+    (k, m) = (len(unmeasured), len(kept))
+    sizes = len(J), J.shape[2], base_rows, J.shape[1], m, k, len(measured), K.shape[2], *K.stride()
+    results: list[kernels.Word] = [np.array([floor, tolerance]), *out, suspect]
+    if k <= m:
+        name = f"torchid_projection_{str(K.dtype).removeprefix('torch.')}"
+        kernels.call(name, (*inputs, kept, unmeasured, measured, *sizes, *results), torch.get_num_threads())
     else:
         suspect.fill_(True)
     doubtful = torch.nonzero(suspect)[:, 0]
@@ -165,19 +135,9 @@ def _write(
             x[doubtful] = made
 
 
-def _project(
-    J: Tensor,
-    active: Tensor,
-    K: Tensor,
-    torque: Tensor,
-    wrench: Tensor,
-    constants: list[Tensor],
-    base_rows: int,
-    floor: float,
-    tolerance: float,
-) -> list[Tensor]:
-    out = _imagine(J, active, K, torque, wrench, constants)
-    _write(J, active, K, torque, wrench, constants, base_rows, floor, tolerance, out)
+def _project(*arguments: Any) -> list[Tensor]:
+    out = _imagine(*arguments)
+    _write(*[*arguments, out])
     return out
 
 
